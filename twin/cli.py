@@ -85,8 +85,7 @@ def scenes() -> None:
     from twin.design.figures_of_merit import FIGURES
     from twin.scene.description import load_scene
     from uwlts.model.library import list_names
-    from uwlts.model.media import GLASSES
-    from uwlts.model.waters import WATERS
+    from uwlts.model.media import GLASSES, WATERS
 
     for name in list_names():
         scene = load_scene(name)

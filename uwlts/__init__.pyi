@@ -22,8 +22,7 @@ from .model.mount import Mount as Mount
 from .model.polynomial_calibration import PolynomialCalibration as PolynomialCalibration
 from .model.sensor import Sensor as Sensor
 from .model.trajectory import Trajectory as Trajectory
-from .optics.design_table import design as design
-from .optics.nominal import nominal as nominal
+from .optics.nominal import design as design, nominal as nominal
 from .radiometry.fit import fit_radiometry as fit_radiometry
 from .radiometry.result import Radiometry as Radiometry
 from .recalibration.recalibrate import recalibrate as recalibrate
@@ -31,8 +30,7 @@ from .reconstruction.reconstruct import reconstruct as reconstruct
 from .reconstruction.verify import verify as verify
 from .registration.register import register as register
 from .report import plot as plot
-from .report.file_description import describe as describe
-from .report.reading import read as read
+from .report.file_description import describe as describe, read as read
 from .storage.capture import Capture as Capture
 from .storage.cloud import PointCloud as PointCloud
 from .storage.export_ import export as export

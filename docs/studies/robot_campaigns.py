@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 import uwlts
 from twin.scene.description import Scene
-from twin.scene.robot import Robot
+from twin.scene.platform_kinds import Robot
 from uwlts.calibration.mount.captured_profiles import CapturedProfiles, reconstruct_profiles
 from uwlts.model.calibration import Calibration
 from uwlts.model.mount import Mount, SphereFound

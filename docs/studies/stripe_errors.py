@@ -14,7 +14,7 @@ from stripe_cases import CROSSING, FILTERED, MASS, VERTEX, Frames, measure
 from stripe_plan import NAME_CORE, PLACES, Plan
 
 from twin.rendering_options import use_variant
-from uwlts.pages.numbers import format_fixed
+from uwlts.pages.toolkit import format_fixed
 from uwlts.runtime.console import progress_bar
 
 PICTURES = Path(__file__).parents[1] / "pictures"

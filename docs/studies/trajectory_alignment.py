@@ -23,13 +23,11 @@ from scipy.spatial.transform import Rotation
 import uwlts
 from tests.uwlts.alignment.test_align import LOOP_MM
 from tests.uwlts.path_views import ALTITUDE_MM, STEP_MM, bed, ride, scan
-from twin.scene.vehicle import Vehicle
-from uwlts.alignment.alignment_options import AlignmentOptions
+from twin.scene.platform_kinds import Vehicle
 from uwlts.alignment.crossing_search import accept_hypothesis, add_overlaps
-from uwlts.alignment.drift_model import DriftModel, choose_drift_model
-from uwlts.alignment.path_prior import PathPrior
+from uwlts.alignment.path_prior import DriftModel, PathPrior, choose_drift_model
 from uwlts.alignment.path_solution import Hypothesis, initial_estimate, settle
-from uwlts.alignment.pieces import Survey, correct_places
+from uwlts.alignment.pieces import AlignmentOptions, Survey, correct_places
 from uwlts.storage.cloud import PointCloud
 
 PASS_MM = np.array(

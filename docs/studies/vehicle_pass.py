@@ -23,7 +23,7 @@ from result_tables import publish, table
 from robot_campaigns import FOR_THE_MOUNT, RADIUS_MM
 
 import uwlts
-from twin.scene.vehicle import Vehicle
+from twin.scene.platform_kinds import Vehicle
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.pose_files import trajectory_path
 from uwlts.storage.truth import Truth

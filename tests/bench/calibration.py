@@ -10,8 +10,8 @@ import numpy as np
 
 from tests.bench.rows import median_seconds
 from tests.uwlts.mount_views import known_mount
+from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.joint.gathering import gather_jointly
-from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.model.calibration import Calibration
 from uwlts.model.trajectory import Trajectory

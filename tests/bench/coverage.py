@@ -30,7 +30,7 @@ from tests.uwlts.simulated_campaign import (
     scan_of_spheres,
 )
 from tests.virtual_sensors import altered
-from uwlts.calibration.joint.procedure import solve_jointly
+from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError
 from uwlts.evaluation.artefact_figures import evaluate_cloud

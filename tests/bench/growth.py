@@ -18,7 +18,7 @@ from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import Noise, gathered, target_series
 from twin.rendering_options import Options, use_variant
 from twin.scene.description import load_scene
-from uwlts.calibration.joint.procedure import solve_jointly
+from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import CaptureHeader

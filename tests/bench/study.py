@@ -8,8 +8,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from twin.design.screening import Batch, evaluate_batch, read_parts, write_part
 from twin.design.study import Study, load_study
+from twin.design.sweep import Batch, evaluate_batch, read_parts, write_part
 from uwlts.runtime.workers import map_in_threads, open_workers
 
 WORKERS = 2

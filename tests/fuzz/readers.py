@@ -25,15 +25,15 @@ from tests.uwlts.storage.test_ros_bags import messages, write_ros2
 from tests.uwlts.storage.test_truth import a_header as truth_header, a_truth
 from tests.uwlts.storage.test_vendor_files import BLOCK
 from twin.datasets.data_set import load_description as load_data_set
-from twin.design.screening import encode_part, read_parts
 from twin.design.study import load_study
-from twin.experiments.published import load_published
+from twin.design.sweep import encode_part, read_parts
+from twin.experiments.figures import load_published
 from twin.scene.campaign import load_campaign
 from twin.scene.description import Mesh, load_scene
 from twin.scene.finish import read_grey
 from twin.scene.objects import _surface_from_file
 from uwlts.acceptance.accept import read_acceptance
-from uwlts.calibration.joint.procedure import solve_jointly
+from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.mount.calibrate_mount import calibrate_mount
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.comparison.change_reference import read_datums, read_reference

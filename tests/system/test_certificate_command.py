@@ -12,7 +12,7 @@ import pytest
 from tests.system.in_process import uwlts
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import Noise, gathered, target_series
-from uwlts.calibration.joint.procedure import solve_jointly
+from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 
 pytestmark = pytest.mark.slow

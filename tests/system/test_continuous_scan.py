@@ -10,7 +10,7 @@ import uwlts
 from tests.system.drawn_hardware import HEIGHT_PX, WIDTH_PX, write_plan
 from twin.devices.gige_camera import ExposedFrame, GigeCamera
 from twin.devices.grbl_controller import GrblController, StageState
-from twin.sensor.peak_finder import PeakFinder
+from twin.sensor.detector import PeakFinder
 from uwlts.errors import DescriptionError, EvaluationError, HardwareError, RangeError
 from uwlts.hardware import continuous
 from uwlts.model.library import load_sensor

@@ -13,7 +13,7 @@ import uwlts
 from tests.virtual_sensors import altered, cropped, plate, scene_of
 from twin.recording.sensor_simulator import SensorSimulator
 from twin.rendering_options import Flaws, Options
-from twin.scene.motion import Shot
+from twin.scene.platforms import Shot
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Sensor
 from uwlts.stripe import extract_stripe

@@ -12,12 +12,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import uwlts
+from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.camera.camera_parameters import CameraOptions
 from uwlts.calibration.camera.lens import LensChoice
 from uwlts.calibration.camera.target_poses import solve_camera
 from uwlts.calibration.capture_evidence import AirEvidence, find_air_evidence
 from uwlts.calibration.joint.gathering import gather_jointly
-from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, gather, solve
 from uwlts.calibration.target_stripes import stripe_on_target
 from uwlts.errors import CaptureError

@@ -371,7 +371,7 @@ def test_an_interrupt_ends_everything_within_seconds(described: Path, tmp_path: 
 
 
 def holds_frames(part: Path) -> bool:
-    """Whether the recording can be read and has an image: one without is removed when it ends early."""
+    """Return True if the recording can be read and has an image; one without is removed when it ends early."""
     try:
         with Capture(part) as capture:
             return len(capture) > 0

@@ -14,7 +14,7 @@ from twin.devices.serve import ServedTwin, serve
 from twin.recording.record_scene import record_scene
 from twin.rendering_options import Flaws, Options
 from twin.scene.description import Scene
-from twin.sensor.peak_finder import INVALID, PeakFinder
+from twin.sensor.detector import INVALID, PeakFinder
 from uwlts.errors import DescriptionError, HardwareError
 from uwlts.hardware import aravis
 from uwlts.hardware.camera_interface import Region

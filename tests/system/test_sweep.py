@@ -17,8 +17,8 @@ import pytest
 from tests.system.in_process import run_program, shared_workers
 from tests.waiting import within
 from twin import cli
-from twin.design.screening import evaluate_study, list_parts, read_parts
 from twin.design.study import load_study
+from twin.design.sweep import evaluate_study, list_parts, read_parts
 from uwlts.model.library import load_sensor
 from uwlts.runtime.workers import Workers
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tests.oracles.fermat import directions_seen, plate
-from uwlts.calibration.camera.target_images import TargetImage
+from uwlts.calibration.camera.camera_parameters import TargetImage
 from uwlts.model.library import find_description, read_table
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Sensor

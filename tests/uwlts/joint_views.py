@@ -6,7 +6,7 @@ import numpy as np
 
 from tests.oracles.fermat import Face, directions_seen, plate, points_seen_on_plane
 from tests.uwlts.calibration_views import STEP_MM, WATER, inside, lattice, lens_of, nine_steps, through_window, turn
-from uwlts.calibration.camera.target_images import TargetImage
+from uwlts.calibration.camera.camera_parameters import TargetImage
 from uwlts.calibration.capture_evidence import AirEvidence, StepEvidence
 from uwlts.calibration.joint.gathering import Gathered, Series
 from uwlts.calibration.joint.parameters import ViewMedium

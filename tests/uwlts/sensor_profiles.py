@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import MEDIUM, Noise, gathered, target_series
 from tests.uwlts.mount_views import MOUNT, SPHERE_MM
-from uwlts.calibration.joint.procedure import solve_jointly
+from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, read_stored_estimate
 from uwlts.calibration.mount.captured_profiles import CapturedProfiles
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions

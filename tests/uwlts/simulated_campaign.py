@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 
 from tests.uwlts.calibration_views import STEP_MM, built_sensor, inside, lattice, turn
 from tests.uwlts.joint_views import TARGET, gathered, lit_points, seen
-from uwlts.calibration.camera.target_images import TargetImage
+from uwlts.calibration.camera.camera_parameters import TargetImage
 from uwlts.calibration.capture_evidence import AirEvidence, StepEvidence
 from uwlts.calibration.joint.gathering import Gathered, Series
 from uwlts.calibration.joint.parameters import ViewMedium

@@ -13,8 +13,7 @@ from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_
 from scipy.special import ndtr, ndtri
 
 from twin.rendering_options import Effects, Flaws, Options
-from twin.scene.description import AnyMotion, PrintedPlate, Scene, load_scene
-from twin.scene.paths import Value, value_at
+from twin.scene.description import AnyMotion, PrintedPlate, Scene, Value, load_scene, value_at
 from uwlts.errors import DescriptionError
 from uwlts.files.reading import is_regular_file
 from uwlts.model.library import find_description, load_sensor, read_table, validate_description

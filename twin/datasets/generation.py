@@ -1,5 +1,8 @@
 """Generation of data sets: draw scenes from a description and render them with labels, one shard at a time.
 
+Each path of each scene has its own random numbers, which depend only on the seed, the scene's number and the path's
+name. More scenes do not change the first ones, and an additional path does not change the values of others.
+
 A shard is written atomically by one process. Its random numbers depend only on the seed and on the numbers of its
 scenes. The files are therefore independent of the number of processes, and an interrupted run continues with the next
 shard.
@@ -9,29 +12,211 @@ from __future__ import annotations
 
 import random
 import re
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from pydantic import JsonValue
 
-from twin.datasets.card import write_card
-from twin.datasets.data_set import DataSetDescription, load_description
-from twin.datasets.draws import DrawnScene, choose_split, draw_scene
-from twin.datasets.labels import make_labels
+from twin.datasets.data_set import EXPOSURE, DataSetDescription, LineStatus, load_description
+from twin.datasets.labels import MEANINGS, make_labels
 from twin.recording.campaigns import PLAN, keep_to_plan, make_folder, require_at_least
-from twin.rendering_options import CPU, Variant, use_variant
-from uwlts.errors import DesignError
+from twin.rendering_options import CPU, Options, Variant, use_variant
+from twin.scene.description import Scene, Value, with_values
+from uwlts.errors import DesignError, Error
+from uwlts.files.json_files import write_model
+from uwlts.files.reading import log_warnings
+from uwlts.files.writing import hash_file
+from uwlts.model.library import validate_description
 from uwlts.model.placement import camera_from_object
+from uwlts.model.sensor import Sensor
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.runtime.workers import run_jobs
-from uwlts.storage.data_set import CARD, SPLITS, SUFFIX, Sample, Split, open_shard
+from uwlts.storage.data_set import (
+    CARD,
+    CARD_FORMAT,
+    CARD_VERSION,
+    SPLITS,
+    SUFFIX,
+    DataCard,
+    DataSet,
+    Sample,
+    Shard,
+    Split,
+    open_shard,
+)
+
+_BRIGHT = 0.03
+"""Largest fraction of pixels at the maximum without a warning; a stripe of 20 px with all its pixels there has 2 %."""
+
+
+@dataclass
+class _Collected:
+    """Statistics of all frames; their memory does not grow with the size of the images."""
+
+    drawn: dict[str, list[Value]] = field(default_factory=dict)
+    status: Counter[int] = field(default_factory=Counter)
+    redrawn: set[int] = field(default_factory=set)
+    bright: int = 0
+
+
+def write_card(
+    folder: Path, description: DataSetDescription, shards: Sequence[tuple[Path, Split, int]], plan: dict[str, JsonValue]
+) -> DataCard:
+    """Write the card of a data set.
+
+    ``shards`` are path, split and number of frames of the complete shards.
+    """
+    per_scene, versions = description.frames_per_scene(), plan["versions"]
+    frames: dict[Split, int] = {split: sum(count for _, own, count in shards if own == split) for split in SPLITS}
+    card = DataCard(
+        title=description.title,
+        notes=description.notes,
+        licence=description.licence,
+        seed=description.seed,
+        versions={str(k): str(v) for k, v in versions.items()} if isinstance(versions, dict) else {},
+        image={
+            "width_px": description.sensor.camera.width_px,
+            "height_px": description.sensor.camera.height_px,
+            "bits": description.sensor.detector.bits,
+        },
+        scenes={split: frames[split] // per_scene for split in SPLITS},
+        frames=frames,
+        redrawn=0,
+        labels={},
+        drawn={},
+        status={},
+        description=description.model_dump(mode="json"),
+        shards=tuple(Shard(name=path.name, split=own, frames=n, sha256=hash_file(path)) for path, own, n in shards),
+    )
+    found = _collect_statistics(DataSet(folder, card, None, ("info", "status")))
+    names = [name for name in DataSet(folder, card, None, None)[0] if name in MEANINGS]
+    card = card.model_copy(
+        update={
+            "redrawn": len(found.redrawn),
+            "labels": {name: MEANINGS[name] for name in names},
+            "drawn": {path: _summary(values) for path, values in found.drawn.items()},
+            "status": {LineStatus(number).name.lower(): count for number, count in sorted(found.status.items())},
+        }
+    )
+    if found.bright:
+        said = f"{found.bright} of {sum(frames.values())} images have more than {100 * _BRIGHT:g} % of their pixels"
+        log_warnings(folder, [f"{said} at the maximum: lower exposure.auto_level, frame.exposure or the ambient light"])
+    # The last file: with it the data set is complete.
+    write_model(folder / CARD, card, file_format=CARD_FORMAT, version=CARD_VERSION, overwrite=True)
+    return card
+
+
+def _collect_statistics(samples: DataSet) -> _Collected:
+    found = _Collected()
+    for sample in samples:
+        info = sample["info"]
+        found.bright += info.get("at_maximum", 0.0) > _BRIGHT
+        for path, value in info["drawn"].items():
+            # Values that all frames of a scene share count once.
+            if info["frame"] == 0 or path == "frame.exposure":
+                found.drawn.setdefault(path, []).append(value)
+        if info["attempt"]:
+            found.redrawn.add(info["scene"])
+        if "status" in sample:
+            numbers, counts = np.unique(sample["status"], return_counts=True)
+            found.status.update(dict(zip(numbers.tolist(), counts.tolist(), strict=True)))
+    return found
+
+
+def _summary(values: Sequence[Value]) -> dict[str, float | str]:
+    if any(isinstance(value, str | bool) for value in values):
+        return {str(value): float(count) for value, count in sorted(Counter(map(str, values)).items())}
+    numbers = np.array(values, float)
+    return {"least": float(numbers.min()), "mean": float(numbers.mean()), "most": float(numbers.max())}
+
+
+# --- the data card ----------------------------------------------------------------------------------------------------
+
+
+_GOLDEN = (5**0.5 - 1) / 2
+"""Golden ratio conjugate: the fractional parts of its first n multiples are evenly spread for every n."""
+
+
+@dataclass(frozen=True)
+class DrawnScene:
+    """Scene of a data set, ready to be rendered.
+
+    ``values`` are the drawn values by path. ``exposures`` (frames,) are factors of the frames' exposure times.
+    ``attempt`` is the number of earlier draws that were rejected.
+    """
+
+    number: int
+    attempt: int
+    split: Split
+    values: dict[str, Value]
+    exposures: tuple[float, ...]
+    sensor: Sensor
+    as_built: Sensor
+    scene: Scene
+    options: Options
+
+
+def choose_split(description: DataSetDescription, scene: int) -> Split:
+    """Return the split of a scene; it does not depend on the number of scenes."""
+    start = np.random.default_rng([description.seed, *b"splits"]).random()
+    place = (start + scene * _GOLDEN) % 1.0
+    for name in SPLITS:
+        place -= getattr(description.splits, name)
+        if place < 0:
+            return name
+    # The fractions can sum to less than 1 because of rounding.
+    return max(SPLITS, key=lambda name: getattr(description.splits, name))
+
+
+def draw_scene(description: DataSetDescription, scene: int, *, attempt: int = 0) -> DrawnScene:
+    """Draw a scene by its number; DescriptionError if its values are not valid for a scene or sensor."""
+
+    def share(path: str, frame: int = 0) -> float:
+        return float(np.random.default_rng([description.seed, scene, attempt, frame, *path.encode()]).random())
+
+    motion = description.scene.motion
+    values = {path: description.draw_value(path, share(path)) for path in description.vary if path != EXPOSURE}
+    by_root: dict[str, dict[str, Value]] = {"sensor": {}, "as_built": {}, "scene": {}, "effects": {}}
+    for path, value in values.items():
+        root, _, rest = path.partition(".")
+        by_root[root][rest] = value
+    source = f"scene {scene} of '{description.title}'"
+    try:
+        described = _apply_values(description.sensor, by_root["sensor"], source)
+        as_built = _apply_values(description.as_built or description.sensor, by_root["sensor"], source)
+        as_built = _apply_values(as_built, by_root["as_built"], source)
+        table = description.scene.model_dump()
+        drawn = (
+            validate_description(Scene, with_values(table, by_root["scene"]), source)
+            if by_root["scene"]
+            else description.scene
+        )
+        seed = int(np.random.SeedSequence([description.seed, scene, attempt]).generate_state(1)[0])
+        options = description.options(seed=seed, strengths=by_root["effects"])
+    except Error as error:
+        text = ", ".join(f"{path} = {value}" for path, value in values.items())
+        raise type(error)(f"{error}\n  drawn: {text}; narrow the distributions of these paths in vary") from error
+    motion = drawn.motion
+    exposures = (1.0,) * motion.images()
+    if EXPOSURE in description.vary:
+        exposures = tuple(float(description.draw_value(EXPOSURE, share(EXPOSURE, k))) for k in range(len(exposures)))
+    return DrawnScene(
+        scene, attempt, choose_split(description, scene), values, exposures, described, as_built, drawn, options
+    )
+
+
+def _apply_values(sensor: Sensor, values: dict[str, Value], source: str) -> Sensor:
+    return validate_description(Sensor, with_values(sensor.model_dump(), values), source) if values else sensor
+
 
 if TYPE_CHECKING:
     from twin.recording.sensor_simulator import SensorSimulator, SimulatedImage
-    from twin.scene.motion import Shot
+    from twin.scene.platforms import Shot
 
 MOST_ATTEMPTS = 20
 """Largest number of draws of a scene until the sensor can measure it; more indicate an error in the description."""

@@ -18,7 +18,7 @@ from uwlts.model.sensor import Detector
 
 if TYPE_CHECKING:
     from twin.recording.sensor_simulator import SensorSimulator, SimulatedImage
-    from twin.scene.motion import Shot
+    from twin.scene.platforms import Shot
 
 _WINDOW_PX = 96
 """Half width of the window around a centre; wider stripes are truncated."""

@@ -23,7 +23,7 @@ from twin.design.sensor_arrays import (
     stack_parameters,
 )
 from twin.design.study import OTHER_COLUMNS, Study
-from twin.scene.paths import Value, value_at, with_values
+from twin.scene.description import Value, value_at, with_values
 from uwlts.errors import DesignError, Error
 from uwlts.model.library import validate_description
 from uwlts.model.sensor import Sensor

@@ -13,7 +13,7 @@ import numpy as np
 
 from twin.backend.llvm import prepare_llvm, preserve_threads
 from twin.design.sensor_arrays import Follow, SensorArrays, compute_adjustments
-from twin.scene.vehicle import GRAVITY_M_S2
+from twin.scene.platform_kinds import GRAVITY_M_S2
 from twin.sensor.detector import PLANCK_TIMES_LIGHT
 from uwlts.errors import RangeError
 from uwlts.optics.design import (

@@ -11,7 +11,7 @@ from pydantic import Field, field_validator, model_validator
 
 from twin.design.figures_of_merit import FIGURES
 from twin.design.sensor_arrays import Follow
-from twin.scene.paths import Value, value_at
+from twin.scene.description import Value, value_at
 from uwlts.errors import DescriptionError
 from uwlts.files.reading import is_regular_file
 from uwlts.model.library import find_description, load_sensor, read_table, validate_description

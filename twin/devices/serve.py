@@ -22,7 +22,7 @@ from twin.recording.render import AnyScene, choose_scene
 from twin.rendering_options import CPU, Options, Variant, use_variant
 from twin.scene.campaign import AnySensor, choose_sensors
 from twin.scene.description import Scene, replace_values
-from twin.scene.motion import Light, Motion, Shot
+from twin.scene.platforms import Light, Motion, Shot
 from uwlts.errors import DescriptionError, DesignError
 from uwlts.model.sensor import Stage
 

@@ -19,7 +19,7 @@ from twin.scene.description import Scene
 from twin.scene.forms import PittedPipe, Weld
 from twin.scene.forms.pitted_pipe import pit_depths, pit_places
 from twin.scene.forms.weld import undercut_depths
-from twin.scene.motion import Motion
+from twin.scene.platforms import Motion
 from uwlts.errors import CaptureError
 
 Flaw = Literal["pit", "dent", "undercut"]

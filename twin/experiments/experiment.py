@@ -7,14 +7,12 @@ from typing import Any
 
 import tomli_w
 
-from twin.experiments.figures import describe_conditions, read_figures, read_flaws
-from twin.experiments.published import load_published
+from twin.experiments.figures import describe_conditions, load_published, read_figures, read_flaws
 from twin.experiments.result import ExperimentResult
 from twin.experiments.runner import COLOURED, Method, evidence_of, inspected_as, is_evaluated, plan_lines, run_stages
 from twin.recording.campaigns import RecordingOptions, make_folder, record_campaigns, require_at_least
 from twin.rendering_options import CPU, Variant
-from twin.scene.campaign import Campaign, CampaignRecording, list_takes, load_campaign
-from twin.scene.stated_deviations import find_understated
+from twin.scene.campaign import Campaign, CampaignRecording, find_understated, list_takes, load_campaign
 from uwlts.errors import DescriptionError, DescriptionWarning
 from uwlts.files.writing import write_atomically
 from uwlts.model.library import validate_description

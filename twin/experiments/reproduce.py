@@ -1,4 +1,4 @@
-"""Reproduction of the thesis's evaluation: experiments with its campaign, compared with its tables.
+"""Reproduction of the thesis's evaluation: experiments with its campaign, compared with its tables; the demonstration.
 
 All scans are measured with all calibrations, with the thesis's stripe detection ("low pass") and the default one. In
 air, the calibration with one refraction is used without its window. "window forgotten" is one without the window.
@@ -157,3 +157,63 @@ def reproduce(
     result = run_experiment(load_campaign(campaign), folder, seeds, options, **how)
     print("\n".join(result.lines()))
     return folder / PAGE
+
+
+# --- demonstration ----------------------------------------------------------------------------------------------------
+
+
+_DEMO_SPHERES = tuple(f"spheres-{place}" for place in _PLACES)
+DEMO_METHODS = (
+    Method(
+        "joint",
+        {"air": ("target-bare", "target-air"), "water": ("target-water",), "step": _STEPS},
+        (*_DEMO_SPHERES, "step-scan", "pipe"),
+    ),
+    Method(
+        "two refractions",
+        {"air": ("target-bare",), "step": _STEPS},
+        _DEMO_SPHERES,
+        options="--refractions 2",
+        suffix="-two-refractions",
+    ),
+    Method(
+        "one refraction",
+        {"air": ("target-air",), "step": _STEPS},
+        _DEMO_SPHERES,
+        options="--refractions 1",
+        suffix="-one-refraction",
+    ),
+)
+"""The joint calibration, and both methods of the thesis."""
+
+
+def demo(out: str | Path = "runs/demo", *, progress: ProgressListener = ignore_progress) -> Path:
+    """Demonstrate the whole process as an experiment: render a campaign, calibrate, reconstruct, evaluate, compare.
+
+    The campaign has realistic imperfections. It is calibrated jointly and by both methods of the thesis. The commands
+    that calibrate and measure are in OUT/commands.sh; each can also be typed by hand. An interrupted demonstration is
+    resumed. The path of the page, OUT/experiment.html, is returned.
+
+    Parameters
+    ----------
+    out
+        Folder for all results.
+    progress
+        As for `predict`.
+
+    Returns
+    -------
+    pathlib.Path
+        The page, ``OUT/experiment.html``.
+
+    Raises
+    ------
+    CommandFailed
+        A command failed; its output gives the reason.
+    DescriptionError, OutputError, SetupError
+        As for `experiment`.
+    """
+    how = {"name": "demo", "methods": DEMO_METHODS, "with_truth": True, "progress": progress}
+    result = run_experiment(load_campaign("demo"), Path(out), [0], RecordingOptions(), **how)
+    print("\n".join(result.lines()))
+    return Path(out) / PAGE

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from pydantic import BaseModel
 
 from twin.experiments.detection import ProbabilityOfDetection
-from twin.experiments.published import PublishedFigure, draw_means, select_means, state_agreement
-from twin.scene.stated_deviations import Understated
+from twin.experiments.figures import PublishedFigure, draw_means, select_means, state_agreement
+from twin.scene.campaign import Understated
 from uwlts._version import __version__
 from uwlts.files.json_files import write_model
 from uwlts.model.short_text import Brief, align_columns

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from twin.scene.vehicle import GRAVITY_M_S2
+from twin.scene.platform_kinds import GRAVITY_M_S2
 
 PATCH_MM = 512.0
 """Period of the surface; the focus of longer waves is at depths of many metres."""

@@ -1,4 +1,7 @@
-"""Illumination of points by the laser sheets, directly or through a mirror, with shadows."""
+"""Illumination of points by the laser sheets, with shadows and mirrors; light that reaches the camera by another way.
+
+The water scatters light of the sheet once into the camera's rays (haze), and the camera's window reflects a ring lamp
+around the lens, seen out of focus."""
 
 from __future__ import annotations
 
@@ -6,15 +9,18 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
+import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.backend.arrays import Bool, Float, Point3f, Vector3f, opaque, opaque_transform
-from twin.light.pose import CLEAR_MM, SensorPose
+from twin.backend.arrays import Bool, Float, Point3f, Vector3f, opaque, opaque_transform, to_jit
+from twin.light.camera import CameraView, RaySegment
+from twin.light.pose import CLEAR_MM, Rays, SensorPose
 from twin.light.sheet import Sheet, SheetLight
-from twin.light.water import AngleTable, one_minus_cosine
+from twin.light.water import AngleTable, Scattering, one_minus_cosine
 from twin.scene.objects import MirrorFace
+from uwlts.model.sensor import Sensor
 
 _LARGEST_SLOPE = 0.7
 """Largest ratio of the distance from the sheet to the distance from the window that `SheetLobe` handles."""
@@ -266,3 +272,107 @@ def make_lights(
 def _bound_slope(x: Float) -> Float:
     """Return slopes with a magnitude of at least 1e-4, so that they can be divisors."""
     return dr.select(dr.abs(x) < 1e-4, dr.mulsign(mi.Float(1e-4), x), x)
+
+
+RING_MM = 22.0, 28.0
+"""Inner and outer radius of the ring in the plane of the entrance pupil, around a C-mount lens (assumed)."""
+_CELL_PX = 4
+"""Spacing of the computed pixels: at the distance of the reflected ring, the blur is many times wider."""
+_PUPIL_SAMPLES = 128
+"""Number of rays per computed pixel: a blurred edge has steps of a hundredth of the ring's brightness."""
+
+
+def reflect_ring(
+    view: CameraView, sensor: Sensor, *, irradiance_w_per_m2: float, distance_mm: float, reflectance: float
+) -> np.ndarray:
+    """Return the irradiance (H, W) in W/mm2 on the image sensor by a lamp ring that the window reflects.
+
+    A diffuse ring of radius R and area A has the radiance L. It illuminates a surface on the axis at the distance d
+    from the pupil with E = L A d^2 / (d^2 + R^2)^2; refraction is neglected. The camera sees the ring mirrored by the
+    inner face of its mounted window.
+    """
+    camera, (inner, outer) = sensor.camera, RING_MM
+    columns, rows = -(-camera.width_px // _CELL_PX), -(-camera.height_px // _CELL_PX)
+    x, y = np.meshgrid(*((np.arange(count) + 0.5) * _CELL_PX - 0.5 for count in (columns, rows)))
+    count = x.size * _PUPIL_SAMPLES
+    index = dr.arange(mi.UInt32, count)
+    pixel, sample = index // _PUPIL_SAMPLES, index % _PUPIL_SAMPLES
+    chief = view.lens.directions(
+        dr.gather(mi.Float, to_jit(mi.Float, x), pixel), dr.gather(mi.Float, to_jit(mi.Float, y), pixel)
+    )
+    # Evenly spread points of a disc: a spiral by the golden angle.
+    turn = math.pi * (3 - math.sqrt(5)) * mi.Float(sample)
+    radius = dr.sqrt((mi.Float(sample) + 0.5) / _PUPIL_SAMPLES)
+    origin, direction = view.lens.trace_through_pupil(chief, mi.Point2f(radius * dr.cos(turn), radius * dr.sin(turn)))
+    normal = mi.Vector3f(*sensor.camera.window.normal().tolist())
+    face = mi.Point3f(0.0, 0.0, camera.window.distance_mm)
+    towards = dr.dot(direction, normal)
+    met = origin + direction * (dr.dot(mi.Vector3f(face - origin), normal) / towards)
+    back = direction - normal * (2 * towards)
+    ring = met + back * (-met.z / back.z)
+    away = dr.norm(mi.Vector2f(ring.x, ring.y))
+    cosine = dr.square(dr.square(chief.z))
+    seen = dr.select((away > inner) & (away < outer) & (back.z < 0), cosine * view.lens.irradiance_on_axis, 0.0)
+    shares = dr.block_sum(seen, _PUPIL_SAMPLES).numpy().reshape(rows, columns) / _PUPIL_SAMPLES
+    middle, area = 0.5 * (inner + outer), math.pi * (outer**2 - inner**2)
+    radiance = 1e-6 * irradiance_w_per_m2 * (distance_mm**2 + middle**2) ** 2 / (area * distance_mm**2)
+    size = columns * _CELL_PX, rows * _CELL_PX
+    whole = cv2.resize(shares.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
+    return np.float32(radiance * reflectance) * whole[: camera.height_px, : camera.width_px]
+
+
+# --- haze -------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SheetCrossing:
+    """Intersections of camera rays with the centre surface of a sheet, at ``distance_mm`` along them.
+
+    ``sense`` is 1 if a ray crosses in the direction of the sheet's normal, else -1. ``irradiance`` is that of the
+    scattered light on the image sensor in W/mm2, without occlusion. ``direction`` and ``exit_mm`` describe the sheet's
+    light there.
+    """
+
+    distance_mm: Float
+    sense: Float
+    irradiance: Float
+    direction: Vector3f
+    exit_mm: Float
+
+
+def intersect_sheet(light: Light, scattering: Scattering, rays: Rays) -> SheetCrossing:
+    """Intersect camera rays with a sheet; for a direct light the result is the same at all poses.
+
+    The line integral of a Gaussian along a straight ray is b p(angle) E sigma sqrt(2 pi) / |cos|. Here p is the phase
+    function and E the irradiance in the sheet's centre.
+    """
+    origin, direction = light.to_sheet_frame(rays.origin, rays.direction)
+    t, middle = light.intersect(origin, direction)
+    towards = dr.dot(direction, middle.normal)
+    peak = middle.irradiance * middle.sigma_mm * math.sqrt(2 * math.pi)
+    # Light travels against the camera ray, so the difference of both directions is a sum here.
+    phase = scattering.phase(0.5 * dr.squared_norm(middle.direction + direction))
+    radiance = scattering.b * phase * peak / dr.maximum(dr.abs(towards), 1e-3) * dr.exp(-scattering.c * t)
+    here = light.evaluate(mi.Point3f(rays.origin + rays.direction * t))
+    return SheetCrossing(
+        t, dr.sign(towards), rays.weight * dr.select(t > 0, radiance, 0.0), here.direction, here.exit_mm
+    )
+
+
+def compute_haze(
+    crossed: SheetCrossing, light: Light, scene: mi.Scene, segment: RaySegment, at_end: SheetLight
+) -> Float:
+    """Return the haze on the image sensor in W/mm2.
+
+    A surface removes the part of the Gaussian behind it. If the surface is in front of the sheet's centre, shadows are
+    tested at the surface: it must not shadow the haze in front of it. ``at_end`` is the light of the sheet at the
+    surfaces that end the rays.
+    """
+    end_sigmas = dr.select(segment.valid, crossed.sense * at_end.distance_mm / at_end.sigma_mm, dr.inf)
+    scattered = crossed.irradiance * (0.5 * (1 + dr.erf(end_sigmas / math.sqrt(2.0))))
+    before = ~segment.valid | (crossed.distance_mm < segment.si.t)
+    place = segment.origin + segment.direction * dr.select(before, crossed.distance_mm, segment.si.t)
+    direction = dr.select(before, crossed.direction, at_end.direction)
+    exit_mm = dr.select(before, crossed.exit_mm, at_end.exit_mm)
+    here = replace(at_end, direction=direction, exit_mm=exit_mm)
+    return dr.select(light.reaches(scene, mi.Point3f(place), here, None, scattered > 0), scattered, 0.0)

@@ -25,8 +25,7 @@ import numpy as np
 from twin.backend.arrays import Float, Point3f, UInt32, Vector4f, begin_kernels, opaque, to_jit
 from twin.light.camera import CameraView, RaySegment, trace_segments
 from twin.light.caustics import CELLS, PATCH_MM, Caustics
-from twin.light.haze import SheetCrossing, compute_haze, intersect_sheet
-from twin.light.illumination import Light, make_lights
+from twin.light.illumination import Light, SheetCrossing, compute_haze, intersect_sheet, make_lights
 from twin.light.image_sampling import (
     NODE_SPACING_PX,
     combine_corners,
@@ -40,14 +39,13 @@ from twin.light.image_sampling import (
 from twin.light.multiple_scattering import IndirectLight, LightSources, decay_with_distance
 from twin.light.particles import Body, sample_spots
 from twin.light.pose import Rays, SensorPose, Travel
-from twin.light.sheet import Sheet, SheetLight
-from twin.light.translucency import lit_sigma_mm, spread_irradiance
+from twin.light.sheet import Sheet, SheetLight, lit_sigma_mm, spread_irradiance
 from twin.light.walk import Walker
 from twin.light.water import Scattering
 from twin.rendering_options import ALL, Effects
 from twin.scene.description import Scene
-from twin.scene.motion import Light as LightName
 from twin.scene.objects import build_objects
+from twin.scene.platforms import Light as LightName
 from uwlts.model.placement import camera_from_object, check_design
 from uwlts.model.sensor import Medium, Sensor
 

@@ -16,8 +16,7 @@ from twin.recording.frame_truth import FrameTruth, depth_map
 from twin.recording.sensor_simulator import SensorSimulator, ShotLight, with_window
 from twin.rendering_options import Options
 from twin.scene.description import Scene, medium_of
-from twin.scene.motion import Shot
-from twin.scene.platforms import Platform
+from twin.scene.platforms import Platform, Shot
 from uwlts.errors import OutputError
 from uwlts.model.sensor import Sensor, Table
 from uwlts.model.trajectory import Trajectory

@@ -7,7 +7,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from twin.light.caustics import Caustics
-from twin.light.lamp_ring import reflect_ring
+from twin.light.illumination import reflect_ring
 from twin.light.pose import Travel
 from twin.light.renderer import LaserFrame, Renderer
 from twin.recording.frame_truth import (
@@ -21,11 +21,20 @@ from twin.recording.frame_truth import (
 from twin.rendering_options import Options
 from twin.scene.description import PrintedPlate, Scene, medium_of, replace_values
 from twin.scene.finish import shift_points
-from twin.scene.motion import Light, Shot
-from twin.scene.platforms import Platform
-from twin.sensor.detector import electrons_per_ms, fixed_pattern, grey_values
-from twin.sensor.flaws import add_glare, as_built, deliver_image, dirt, laser_shares, vignette
-from twin.sensor.peak_finder import INVALID, PeakFinder
+from twin.scene.platforms import Light, Platform, Shot
+from twin.sensor.detector import (
+    INVALID,
+    PeakFinder,
+    add_glare,
+    as_built,
+    deliver_image,
+    dirt,
+    electrons_per_ms,
+    fixed_pattern,
+    grey_values,
+    laser_shares,
+    vignette,
+)
 from twin.sensor.speckle import Speckle, coherence
 from uwlts.errors import DesignError
 from uwlts.model.placement import camera_from_object

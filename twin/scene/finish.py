@@ -19,8 +19,16 @@ from pydantic import TypeAdapter
 
 from twin.backend.arrays import Bool, Float, Point3f, SurfaceInteraction3f, UInt32, opaque, to_jit
 from twin.scene.description import AnyObject, FlatObject, PrintedPlate, SceneObject
-from twin.scene.subsurface import LateralSpread, lateral_spread
-from twin.scene.surfaces import WAVES, FinishProperties, draw_patches, draw_waves, log_deviation, move_waves
+from twin.scene.surfaces import (
+    WAVES,
+    FinishProperties,
+    LateralSpread,
+    draw_patches,
+    draw_waves,
+    lateral_spread,
+    log_deviation,
+    move_waves,
+)
 from uwlts.errors import DescriptionError, ImageError
 from uwlts.model.media import check_range
 from uwlts.storage.image_file import read_image

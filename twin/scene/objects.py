@@ -17,7 +17,7 @@ from twin.scene.description import AnyObject, Ball, Block, CirclePlate, Mesh, Pi
 from twin.scene.finish import albedo_parts, body_spread, finish_bsdf, register_textures, view_along_normal
 from twin.scene.forms.triangles import bowed_plate, rounded_box
 from twin.scene.scene_object import FreeForm
-from twin.scene.subsurface import GAUSSIANS
+from twin.scene.surfaces import GAUSSIANS
 from uwlts.errors import DescriptionError
 from uwlts.files.reading import require_regular_file
 
@@ -89,7 +89,7 @@ class Objects:
     def spread_ahead_mm(self, si: SurfaceInteraction3f, cosine: Float) -> Float:
         """Return the mean way of light in the bodies hit, per sine of its incidence angle of the given cosine.
 
-        See `twin.scene.subsurface.LateralSpread`; the way is along the surface.
+        See `twin.scene.surfaces.LateralSpread`; the way is along the surface.
         """
         index = dr.maximum(self._fact("spread_index", si), 1.0)
         inside = dr.safe_sqrt(1 - (1 - dr.square(cosine)) / dr.square(index))

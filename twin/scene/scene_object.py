@@ -49,7 +49,7 @@ class SceneObject(Pose):
     ``patch_share`` of the surface. A line on the surface is within a patch for ``patch_length_mm`` on average.
 
     ``mean_free_path_mm`` is the transport mean free path of light in a translucent body, which widens the stripe and
-    shifts it ahead along the laser's direction (`twin.scene.subsurface`); 0 for an opaque one.
+    shifts it ahead along the laser's direction (`twin.scene.surfaces`); 0 for an opaque one.
 
     ``retroreflection`` is the coefficient of retroreflected luminance in cd/m2/lx (CIE 17-24-104), for tapes and marks
     that return the light of the lamp beside the camera. The laser is too far beside: its stripe shows ``reflectance``.

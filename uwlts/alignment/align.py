@@ -1,7 +1,7 @@
 """Trajectory correction from surfaces that a scan shows more than once.
 
-`drift_model` describes the drift of the navigation, and `path_prior` converts it into a prior of the correction.
-`crossing_search` finds the crossings, and `path_estimate` holds the correction that they determine.
+`path_prior` describes the drift of the navigation and converts it into a prior of the correction. `crossing_search`
+finds the crossings, and `path_solution` the correction that they determine.
 """
 
 from __future__ import annotations
@@ -14,13 +14,10 @@ import numpy as np
 from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
-from uwlts.alignment.alignment_options import AlignmentOptions
 from uwlts.alignment.crossing_search import Search, accept_crossings
-from uwlts.alignment.drift_model import choose_drift_model
-from uwlts.alignment.path_estimate import Pair, PathEstimate
-from uwlts.alignment.path_prior import PathPrior
-from uwlts.alignment.path_solution import initial_estimate, settle
-from uwlts.alignment.pieces import Survey
+from uwlts.alignment.path_prior import PathPrior, choose_drift_model
+from uwlts.alignment.path_solution import Pair, PathEstimate, initial_estimate, settle
+from uwlts.alignment.pieces import AlignmentOptions, Survey
 from uwlts.argument_types import check_arguments
 from uwlts.errors import EvaluationError
 from uwlts.files.json_files import write_record

@@ -17,10 +17,10 @@ from scipy.fft import next_fast_len
 from scipy.ndimage import gaussian_filter, maximum_filter
 from scipy.spatial.transform import Rotation
 
-from uwlts.alignment.alignment_options import AlignmentOptions
-from uwlts.alignment.path_estimate import Pair, PathEstimate
 from uwlts.alignment.path_solution import (
     Hypothesis,
+    Pair,
+    PathEstimate,
     bring_together,
     refine_nodes,
     refit,
@@ -28,6 +28,7 @@ from uwlts.alignment.path_solution import (
     solve,
     with_drift,
 )
+from uwlts.alignment.pieces import AlignmentOptions
 from uwlts.fitting.least_squares import rms_distance
 from uwlts.model.calibration import rigid_transform
 from uwlts.registration.joint_registration import fit_pair

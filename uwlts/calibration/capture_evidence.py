@@ -9,8 +9,8 @@ from functools import partial
 import numpy as np
 from pydantic import ValidationError
 
+from uwlts.calibration.camera.camera_parameters import TargetImage
 from uwlts.calibration.camera.image_quality import explain_missing_target
-from uwlts.calibration.camera.target_images import TargetImage
 from uwlts.calibration.target_stripes import TargetStripe, stripe_on_target
 from uwlts.errors import CalibrationError, DescriptionError, ImageError, TargetError, describe_problems
 from uwlts.model.artefacts import StepStandard

@@ -3,11 +3,11 @@
 import sys
 
 # Their import registers the commands.
-from uwlts.cli import calibrating, describing, findings, measuring, recording
+from uwlts.cli import calibrating, measuring, recording
 from uwlts.cli.command_options import app
 from uwlts.runtime.console import run
 
-__all__ = ["app", "calibrating", "describing", "findings", "main", "measuring", "recording"]
+__all__ = ["app", "calibrating", "main", "measuring", "recording"]
 
 
 def main() -> None:

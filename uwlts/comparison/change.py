@@ -19,13 +19,13 @@ from uwlts.comparison.change_reference import (
     read_reference,
     require_enough,
     require_same_unit,
+    select_seen_side,
     stated_variance,
 )
 from uwlts.comparison.ideal_shapes import IdealShape, place_shape
 from uwlts.comparison.local_means import OPTIONS, TWO_SIDED, LocalMeans, average_locally
-from uwlts.comparison.seen_side import select_seen_side
 from uwlts.errors import EvaluationError
-from uwlts.fitting.point_spacing import choose_disc_diameter, number_cubes
+from uwlts.fitting.local_surface import choose_disc_diameter, number_cubes
 from uwlts.model.sensor import Table
 from uwlts.model.short_text import Brief
 from uwlts.registration.surface_registration import Registration, SurfaceSample, register_to_surface

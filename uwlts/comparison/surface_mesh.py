@@ -18,8 +18,7 @@ from scipy.spatial import KDTree
 
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.figures import TOWARDS_SENSOR
-from uwlts.fitting.local_surface import LocalSurface, SurfacePoints, surface_normals
-from uwlts.fitting.point_spacing import choose_disc_diameter, group_rows
+from uwlts.fitting.local_surface import LocalSurface, SurfacePoints, choose_disc_diameter, group_rows, surface_normals
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.cloud import PointCloud, project_image_errors, project_variance
 from uwlts.storage.cloud_files import load_cloud

@@ -11,7 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from uwlts.desk.scan_service import ScanService
+from uwlts.desk.scan import ScanService
 from uwlts.errors import Error, SetupError
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.scan_plan import ScanPlan, load_plan

@@ -11,7 +11,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from uwlts.inspection.section import Section, order_profile
+from uwlts.inspection.picking import Section, order_profile
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.calibration import Calibration
 from uwlts.pages.cloud_figure import CloudField

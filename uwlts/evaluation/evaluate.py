@@ -11,8 +11,17 @@ from uwlts.argument_types import check_arguments
 from uwlts.errors import EvaluationError, describe_problems
 from uwlts.evaluation.artefact_figures import evaluate_cloud
 from uwlts.evaluation.figure_uncertainty import figure_uncertainties, shift_std_mm
-from uwlts.evaluation.figures import Figure, FigureKey, FigureUncertainty, Quantity, figure_keys
-from uwlts.evaluation.truth_comparison import Count, StoredResult, TruthComparison, compare_with_truth
+from uwlts.evaluation.figures import (
+    Count,
+    Figure,
+    FigureKey,
+    FigureUncertainty,
+    Quantity,
+    StoredResult,
+    TruthComparison,
+    compare_with_truth,
+    figure_keys,
+)
 from uwlts.files.json_files import EDITED, read_model, write_model
 from uwlts.fitting.least_squares import fit_rigid_transform
 from uwlts.model.artefacts import Artefact, parse_artefact, read_artefact

@@ -7,12 +7,12 @@ import numpy as np
 from uwlts.evaluation.artefact_figures import (
     PipeEvaluation,
     PlaneEvaluation,
+    SphereEvaluation,
     StepEvaluation,
     measure_ovality,
     measure_step,
 )
 from uwlts.evaluation.figures import ArtefactEvaluation, FigureUncertainty, Quantity, spread_mm
-from uwlts.evaluation.spheres import SphereEvaluation
 from uwlts.fitting.propagation import LinearisedFit, PointErrors, noise_shifts
 from uwlts.model.artefacts import StepStandard
 from uwlts.shapes.cylinder import Cylinder

@@ -1,17 +1,24 @@
-"""Local surface at any place: oriented normals, and curved patches weighted by the points' covariance.
+"""Local surface at any place: spacing of points, oriented normals, curved patches, and errors of patches.
 
 A patch is a paraboloid over the tangent plane, fitted by moving least squares (Levin, Math. Comp. 67, 1998) to the
 points on one side of a wall. Its height is linear in the points, so their uncertainty propagates linearly.
+
+Overlapping patches share points, and patches along an image share its position. Their heights are therefore correlated:
+positively by errors of images. Noise correlates some of them negatively, because a second-order fit subtracts points
+near the border of its disc. The variance of a sum of heights follows from the errors themselves.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_array, hstack
+from scipy.spatial import KDTree
 
 from uwlts.runtime.compiled import compiled, compiled_with_arrays
+from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PointCloud
 
 _SAME_SIDE = 0.5
 """Cosine of the largest angle (60 deg) between normals of points on the same side of a wall or an edge."""
@@ -281,3 +288,137 @@ def _fill_terms(point, place, normal, first, second, own, radius, by):
         return 0.0
     by[0], by[1], by[2], by[3], by[4], by[5] = 1.0, u, v, u * u, u * v, v * v
     return (1.0 - across) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class PatchErrors:
+    """Independent errors of a cloud, and the changes of the heights of P patches by them."""
+
+    near: np.ndarray  # (P, K) int; averages of points in each disc
+    rows: np.ndarray
+    """(P, K) float32; derivatives of the height in the middle of a disc by the heights of these averages."""
+    noise_mm: np.ndarray  # (P,); standard deviation of one point along the normal
+    normals: np.ndarray  # (P, 3); normals of the patches in the cloud's frame
+    counts: np.ndarray  # (C,); number of points in each average
+    images: csr_array  # (C, I) sparse; fraction of the points of each average in each image
+    image_shifts_mm: np.ndarray
+    """(J, C, 3); shift of each average for one standard deviation of each error of its image."""
+
+    def __getitem__(self, selection: Any) -> PatchErrors:
+        """Select patches by a slice, indices or a mask."""
+        names = ("near", "rows", "noise_mm", "normals")
+        return replace(self, **{name: getattr(self, name)[selection] for name in names})
+
+    def height_changes(self) -> csr_array:
+        """Return the changes (P, C + J I), mm, of the heights for one standard deviation of each independent error."""
+        return csr_array(hstack([self._by_noise(), *self._by_images()], format="csr"))
+
+    def noise_variance(self) -> np.ndarray:
+        """Return the variance (P,), mm2, of the heights by noise."""
+        return self.noise_mm**2 * np.sum(self.rows**2 / self.counts[self.near], axis=1)
+
+    def image_variance(self) -> np.ndarray:
+        """Return the variance (P,), mm2, of the heights by errors of images."""
+        return sum(
+            (np.asarray((each * each).sum(axis=1)).ravel() for each in self._by_images()), np.zeros(len(self.rows))
+        )
+
+    def correlation(self, *, by_images: bool) -> float:
+        """Return the variance of the sum of all heights relative to the sum of their variances, by noise or images."""
+        parts = self._by_images() if by_images else [self._by_noise()]
+        together = sum(float(np.sum(np.asarray(each.sum(axis=0)) ** 2)) for each in parts)
+        apart = sum(float((each * each).sum()) for each in parts)
+        return together / apart if apart > 0 else 1.0
+
+    def _by_noise(self) -> csr_array:
+        return self._sparse(self.rows * self.noise_mm[:, None] / np.sqrt(self.counts[self.near]))
+
+    def _by_images(self) -> list[csr_array]:
+        along = (np.einsum("pki,pi->pk", shift[self.near], self.normals) for shift in self.image_shifts_mm)
+        return [csr_array(self._sparse(self.rows * each) @ self.images) for each in along]
+
+    def _sparse(self, values: np.ndarray) -> csr_array:
+        ends = np.arange(0, self.near.size + 1, self.near.shape[1])
+        return csr_array((values.ravel(), self.near.ravel(), ends), shape=(len(self.near), len(self.counts)))
+
+
+POINTS_PER_DISC = 30
+"""Number of points of an averaging disc: the mean has about a fifth of their noise."""
+_IMAGES_PER_DISC = 3.0
+"""Least number of images in a disc, so that errors of single images average."""
+_SAMPLED = 2000
+"""Number of points for the median spacing, which is then accurate to a few percent."""
+_ASKED = 64
+"""Number of points for the median distance between images."""
+_STEEPEST = 0.3
+"""Least cosine of the angle between surface normal and laser, which limits the length of a footprint."""
+
+
+def choose_disc_diameter(points_mm: np.ndarray, frame: np.ndarray | None = None) -> float:
+    """Return the diameter of discs with about thirty points (N, 3) and, given ``frame`` (N,), at least three images."""
+    tree, sample = KDTree(points_mm), points_mm[:: max(1, len(points_mm) // _SAMPLED)]
+    seventh = np.asarray(tree.query(sample, k=7)[0])[:, 6]
+    # A disc with the radius of the sixth neighbour holds six points. Thirty points need five times its area.
+    disc = float(2 * np.median(seventh) * np.sqrt(POINTS_PER_DISC / 6.0))
+    if frame is None or (frame < 0).any() or frame.min() == frame.max():
+        return disc
+    return max(disc, _IMAGES_PER_DISC * _between_images(points_mm, frame))
+
+
+def _between_images(points_mm: np.ndarray, frame: np.ndarray) -> float:
+    """Return the median distance between a point and the nearest point of another image."""
+    middle = np.unique(frame)
+    chosen = np.isin(frame, middle[:: max(1, len(middle) // 20)])
+    sample = np.flatnonzero(chosen)
+    sample = sample[:: max(1, len(sample) // _ASKED)]
+    least = [np.linalg.norm(points_mm[frame != frame[k]] - points_mm[k], axis=1).min() for k in sample]
+    return float(np.median(least))
+
+
+def measure_spacing(places: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Return the median spacings (2,) of places (N, 2) near chosen (K,) ones, along the first and the second direction.
+
+    The next place along a direction lies within 45 deg of it: points of the same profile do not count across it.
+    """
+    sample = chosen[:: max(1, len(chosen) // _ASKED)]
+    least = np.full((len(sample), 2), np.inf)
+    for number, point in enumerate(sample):
+        away = np.abs(places - places[point])
+        for k in (0, 1):
+            ahead = away[:, k][away[:, k] > away[:, 1 - k]]
+            least[number, k] = ahead.min(initial=np.inf)
+    known = np.isfinite(least)
+    return np.array([np.median(least[known[:, k], k]) if known[:, k].any() else 0.0 for k in (0, 1)])
+
+
+def project_footprint(cloud: PointCloud, chosen: np.ndarray, tangents: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the footprints of chosen (K,) points along tangents (K, 2, 3), and their relative uncertainty.
+
+    A footprint is a pair of standard deviations (K, 2) in mm. The uncertainty is that of their squares. Both are zero
+    if the cloud states no footprint, for example for moved sensors or clouds of other programs.
+    """
+    known = cloud.metadata.get(FOOTPRINT)
+    if not (isinstance(known, list) and len(known) == 2 and all(isinstance(each, float) for each in known)):
+        return np.zeros((len(chosen), 2)), 0.0
+    size, std = np.array(known, float), cloud.metadata.get(FOOTPRINT_STD)
+    # The laser is parallel to Z. Its footprint in X and Y is longer on an inclined surface.
+    flat = tangents[:, :, :2]
+    leaning = np.abs(flat[:, 0, 0] * flat[:, 1, 1] - flat[:, 0, 1] * flat[:, 1, 0])
+    # Inverse times its determinant, without the signs of its elements.
+    inverse = flat[:, ::-1, ::-1]
+    spread = np.linalg.norm(inverse * size, axis=2) / np.maximum(leaning, _STEEPEST)[:, None]
+    return spread, float(std) if isinstance(std, float) else 0.0
+
+
+def number_cubes(points: np.ndarray, side: float) -> np.ndarray:
+    """Return the cube (N,) of each point (N, 3) in a cubic grid; coordinates must not be negative."""
+    cells = np.floor(points / side).astype(np.int64)
+    _, rows, layers = cells.max(axis=0) + 1
+    return (cells[:, 0] * rows + cells[:, 1]) * layers + cells[:, 2]
+
+
+def group_rows(keys: np.ndarray) -> dict[int, np.ndarray]:
+    """Return the rows with each key, in order; keys (N,) must not be negative."""
+    order = np.argsort(keys, kind="stable")
+    starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
+    return dict(zip(keys[order][starts].tolist(), np.split(order, starts[1:]), strict=True)) if len(order) else {}

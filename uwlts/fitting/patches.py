@@ -17,8 +17,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
 from uwlts.errors import EvaluationError
-from uwlts.fitting.patch_errors import PatchErrors
-from uwlts.fitting.point_spacing import number_cubes
+from uwlts.fitting.local_surface import PatchErrors, number_cubes
 from uwlts.storage.cloud import PointUncertainty, project_image_errors, project_variance
 
 _CELLS_PER_RADIUS = 3.0

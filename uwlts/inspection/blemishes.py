@@ -23,13 +23,12 @@ from scipy.spatial import KDTree
 
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import fit_biweight
-from uwlts.fitting.point_spacing import measure_spacing
+from uwlts.fitting.local_surface import measure_spacing
 from uwlts.fitting.propagation import PointErrors
-from uwlts.inspection.bead_profiles import NODES, cubic_weights
+from uwlts.inspection.bead_profiles import BIAS_FACTOR, NODES, cubic_weights
 from uwlts.inspection.bell_maps import SEARCH_RULE, UnrolledSurface
 from uwlts.inspection.blemish_search import BlemishSearch, Indication
 from uwlts.inspection.features import BIAS_STD, COVERAGE, COVERAGE_FACTOR, SEED, FeatureKind, FeatureValue, plain_value
-from uwlts.inspection.noisy_extremes import BIAS_FACTOR
 
 
 class _Rule:

@@ -19,12 +19,11 @@ from scipy.stats import norm
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.figures import TOWARDS_SENSOR
 from uwlts.fitting.least_squares import robust_std
-from uwlts.fitting.point_spacing import project_footprint
+from uwlts.fitting.local_surface import project_footprint
 from uwlts.fitting.propagation import PointErrors, group_neighbours
+from uwlts.inspection.bead_profiles import BIAS_FACTOR
 from uwlts.inspection.features import WITHOUT_UNCERTAINTY, Feature, FeatureKind, FeatureValue, Inspection, plain_value
-from uwlts.inspection.noisy_extremes import BIAS_FACTOR
-from uwlts.shapes.circle import Circle
-from uwlts.shapes.flat import Plane
+from uwlts.shapes.flat import Circle, Plane
 from uwlts.shapes.step import StepFace, label_step_faces
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import load_cloud
@@ -366,7 +365,7 @@ def _note_omission(face: _Face, place: np.ndarray, reason: str) -> str:
 def _measure_flatness(cloud: PointCloud, face: _Face, used: np.ndarray) -> FeatureValue:
     """Return the range of the cell means of a face.
 
-    Noise increases the range. The bias follows from adding the noise once more (`uwlts.inspection.noisy_extremes`), and
+    Noise increases the range. The bias follows from adding the noise once more (`uwlts.inspection.bead_profiles`), and
     is subtracted. The uncertainty contains this increase.
     """
     inner = _mask_inner_points(cloud, used)

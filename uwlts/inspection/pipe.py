@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import robust_std
-from uwlts.fitting.point_spacing import project_footprint
+from uwlts.fitting.local_surface import project_footprint
 from uwlts.fitting.propagation import PointErrors
 from uwlts.inspection.bell_maps import SEARCH_RULE, UnrolledSurface
 from uwlts.inspection.blemish_search import BlemishSearch, Indication, search_blemishes

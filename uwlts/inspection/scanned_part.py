@@ -18,8 +18,8 @@ from scipy.spatial import KDTree
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import MAD_TO_STD, robust_std, thin_evenly
 from uwlts.inspection.pipe_form import FORM_RULE, PipeForm, fit_pipe, refit_pipe
-from uwlts.shapes.circle import Circle
 from uwlts.shapes.cylinder import Cylinder
+from uwlts.shapes.flat import Circle
 from uwlts.storage.cloud import PointCloud
 
 

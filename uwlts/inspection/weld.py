@@ -17,9 +17,17 @@ from scipy import ndimage, sparse
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.figures import TOWARDS_SENSOR
 from uwlts.fitting.least_squares import MAD_TO_STD, fit_biweight, fit_robustly, principal_axes, robust_std, thin_evenly
-from uwlts.fitting.point_spacing import project_footprint
+from uwlts.fitting.local_surface import project_footprint
 from uwlts.fitting.propagation import PointErrors
-from uwlts.inspection.bead_profiles import NO_WEIGHT, NODES, BeadProfiles, interpolation_rows, profile_rows
+from uwlts.inspection.bead_profiles import (
+    NO_WEIGHT,
+    NODES,
+    BeadProfiles,
+    Largest,
+    interpolation_rows,
+    largest_mean,
+    profile_rows,
+)
 from uwlts.inspection.features import (
     BIAS_STD,
     COVERAGE_FACTOR,
@@ -31,7 +39,6 @@ from uwlts.inspection.features import (
     Inspection,
     plain_value,
 )
-from uwlts.inspection.noisy_extremes import Largest, largest_mean
 from uwlts.shapes.flat import Plane
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import load_cloud

@@ -158,7 +158,8 @@ class FanModel(Description):
 class SheetModel(Description):
     """Laser sheet in the camera frame: in air and without bow, the plane ``normal . x = offset_mm``.
 
-    Without a ``fan``, the sheet is this plane in every medium; `uwlts.optics.sheet` describes the sheet with a fan.
+    Without a ``fan``, the sheet is this plane in every medium; `uwlts.optics.triangulation` describes the sheet with a
+    fan.
     """
 
     normal: UnitVector

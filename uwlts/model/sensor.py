@@ -23,7 +23,7 @@ from pydantic_core import to_jsonable_python
 
 from uwlts.errors import DescriptionError
 from uwlts.files.reading import require_plain
-from uwlts.model import media, phase_functions, waters
+from uwlts.model import media, phase_functions
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -300,7 +300,7 @@ AnyPhase = str | phase_functions.DescribedPhase | None
 class Medium(Description):
     """Medium of a measurement: air, fresh or sea water with temperature and salinity, or custom with a given index.
 
-    Water is pure by default. ``water`` selects a natural water of `uwlts.model.waters`; ``turbidity`` interpolates from
+    Water is pure by default. ``water`` selects a natural water of `uwlts.model.media`; ``turbidity`` interpolates from
     pure (0) over clear (1) and coastal (2) to harbour (3). ``absorption_per_m`` and ``scattering_per_m`` replace the
     resulting coefficients.
 
@@ -329,8 +329,8 @@ class Medium(Description):
     @field_validator("water")
     @classmethod
     def _check_water(cls, value: str | None) -> str | None:
-        if value is not None and value not in waters.WATERS:
-            raise ValueError(f"unknown water; known are {', '.join(waters.WATERS)}")
+        if value is not None and value not in media.WATERS:
+            raise ValueError(f"unknown water; known are {', '.join(media.WATERS)}")
         return value
 
     @field_validator("phase")
@@ -412,10 +412,10 @@ class Medium(Description):
         """Return whether absorption and scattering follow from the properties of water."""
         return self.kind in ("fresh", "sea") or self.water is not None or self.turbidity is not None
 
-    def _particles(self, wavelength_nm: float) -> waters.Particles:
+    def _particles(self, wavelength_nm: float) -> media.Particles:
         if self.turbidity is not None:
-            return waters.particles_at(self.turbidity, wavelength_nm=wavelength_nm)
-        return waters.find_water(self.water or "pure").particles(wavelength_nm)
+            return media.particles_at(self.turbidity, wavelength_nm=wavelength_nm)
+        return media.find_water(self.water or "pure").particles(wavelength_nm)
 
     def _phase_function(self) -> phase_functions.PhaseFunction:
         if isinstance(self.phase, phase_functions.DescribedPhase):
@@ -423,7 +423,7 @@ class Medium(Description):
         # The turbidity scale interpolates between Petzold's stations.
         name = self.phase or ("molecular" if self.turbidity is None else "petzold")
         if self.phase is None and self.water is not None:
-            name = waters.find_water(self.water).phase
+            name = media.find_water(self.water).phase
         parameters = {"asymmetry", "particle_index", "particle_slope", "backscatter_share"}
         keys = self.model_dump(include=parameters, exclude_none=True)
         return phase_functions.phase_function_kind(name).of_keys(keys)
@@ -667,7 +667,7 @@ class CaptureHeader(Description):
 
     ``medium_name`` is the name of the medium in the sensor's description. ``stage_direction`` is the nominal direction
     of the sensor's motion by the stage, a unit vector in the OCS. ``saturation_dn`` is the grey value of clipped
-    pixels; values above 2^k - 1 are marks (`uwlts.model.clipped`). ``target`` and ``artefact`` describe the measured
+    pixels; values above 2^k - 1 are marks (`uwlts.stripe.exposures`). ``target`` and ``artefact`` describe the measured
     object; `parse_target` and `parse_artefact` validate them later. ``T_platform_sensor`` (4, 4), mm, is the nominal
     pose of the sensor on a moving platform; with it, the frames' poses are those of the platform. ``provenance``
     documents how the capture was recorded.

@@ -1,14 +1,27 @@
-"""Calibration from a sensor's description alone, for designs and for checks with true parameters."""
+"""Sensors as described: the nominal calibration, and the table of the design formulas' results."""
 
 import math
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
+from uwlts.errors import DesignError
 from uwlts.model.calibration import Calibration, CameraModel, SheetModel, WindowModel
 from uwlts.model.library import load_sensor
+from uwlts.model.media import GLASSES
 from uwlts.model.placement import camera_from_object, laser_pose, view_of_sheet
 from uwlts.model.sensor import Medium, Sensor
+from uwlts.optics.design import (
+    FARTHEST_MM,
+    SheetGeometry,
+    line_needed_mm,
+    scheimpflug_angle_rad,
+    speckle_limit_um,
+    standoff_mm,
+    trace_to_points,
+    window_thickness_mm,
+)
 from uwlts.optics.window import trace_window
 
 # Number of rays across the fan for the fit of the plane.
@@ -90,3 +103,109 @@ def _sheet(sensor: Sensor, medium: Medium | None) -> SheetModel:
     normal = np.linalg.svd(points - middle, full_matrices=False)[2][2]
     normal *= np.sign(normal @ pose.normal)
     return SheetModel(normal=tuple(normal), offset_mm=float(normal @ middle))
+
+
+class DesignRow(NamedTuple):
+    """A row of the design table."""
+
+    name: str
+    value: float
+    unit: str
+    source: str
+
+
+def design(sensor: str | Path | Sensor, *, medium: str) -> list[DesignRow]:
+    """Calculate resolution, line length, depth range and speckle limit of a sensor with the design formulas.
+
+    Depths and ranges are measured along the camera's axis unless a row says otherwise.
+
+    Parameters
+    ----------
+    sensor : str, Path or Sensor
+        Name or path of a sensor description, or the description itself.
+    medium : str
+        One of the sensor's media.
+
+    Returns
+    -------
+    list of DesignRow
+        Rows of name, value, unit and source.
+
+    Raises
+    ------
+    DescriptionError
+        The sensor or the medium is unknown, or the description cannot be read.
+    DesignError
+        As `uwlts.optics.design.SheetGeometry.from_description`.
+    """
+    sensor = sensor if isinstance(sensor, Sensor) else load_sensor(sensor)
+    camera, geometry = sensor.camera, SheetGeometry.from_description(sensor, sensor.medium(medium))
+    window, standoff = geometry.window, float(standoff_mm(geometry.laser))
+    outer = camera.window.distance_mm + camera.window.thickness_mm / window.normal[2] if camera.window.mounted else 0.0
+    near, far = map(float, geometry.depths_in_view(np, outer))
+    if not far > outer + 1:
+        raise DesignError("the sheet leaves the camera's view before the window's outer face: increase the baseline")
+    far = far if far < FARTHEST_MM else math.inf
+    motion = geometry.crossing_motion()
+    depth, along_laser = float(abs(motion[2])), float(abs(motion @ geometry.laser.axis))
+    leaning, tangent = along_laser / depth, float(abs(motion[int(geometry.along_width)])) / depth
+    apparent = float(trace_to_points(np, window, geometry.point(0.0)).apparent_mm)
+    speckle = speckle_limit_um(
+        wavelength_nm=sensor.laser.wavelength_nm,
+        focal_length_mm=camera.focal_length_mm,
+        f_number=camera.f_number,
+        distance_mm=apparent,
+    )
+    depths = np.array([sensor.volume.near_mm + outer, standoff, sensor.volume.far_mm + outer])
+    low, high = geometry.line_ends(np, (depths - standoff) / geometry.laser.axis[2])
+    near_line, line, far_line = high - low
+    index = window.medium_index
+    by_factor = standoff * camera.pixel_size_um * 1e-3 / (camera.focal_length_mm * tangent * index)
+    tilt = scheimpflug_angle_rad(
+        triangulation_angle_rad=math.atan(index * tangent), magnification=camera.focal_length_mm / apparent
+    )
+    needed = line_needed_mm(pipe_diameter_mm=300.0, passes=5)
+    snell = "with Snell's law"
+    return [
+        DesignRow("stand-off from the pupil", standoff, "mm", f"Eq. 2.8 {snell}"),
+        DesignRow("stand-off from the window", standoff - outer, "mm", f"Eq. 2.8 {snell}"),
+        DesignRow("sheet in view, nearest to the window", near - outer, "mm", f"Eq. 2.8 {snell}"),
+        DesignRow("sheet in view, farthest from the window", far - outer, "mm", f"Eq. 2.8 {snell}"),
+        DesignRow("depth in view", far - near, "mm", f"Eq. 2.8 {snell}"),
+        DesignRow("depth in view along the laser's axis", (far - near) * leaning, "mm", "over cos theta_t"),
+        DesignRow("depth per pixel at the stand-off", depth, "mm/px", f"Eq. 2.9 {snell}"),
+        DesignRow("depth per pixel along the laser's axis", along_laser, "mm/px", "over cos theta_t"),
+        DesignRow("depth per pixel by the thesis's factor n", by_factor, "mm/px", "Eq. 2.9 over n, section 3.1.2"),
+        DesignRow("line length at the volume's near end", float(near_line), "mm", f"Eq. 2.10, corrected, {snell}"),
+        DesignRow("line length at the stand-off", float(line), "mm", f"Eq. 2.10, corrected, {snell}"),
+        DesignRow("line length at the volume's far end", float(far_line), "mm", f"Eq. 2.10, corrected, {snell}"),
+        DesignRow("line needed for a 300 mm pipe in 5 passes", needed, "mm", "Figure 27"),
+        DesignRow("image plane to lens axis, sheet in focus", math.degrees(tilt), "deg", "Eq. 2.12, Scheimpflug"),
+        DesignRow("speckle limit across the camera's axis", speckle, "um", "Dorsch et al. 1994, contrast 0.71"),
+        DesignRow("speckle limit along the laser's axis", speckle * leaning / tangent, "um", "over sin theta_t"),
+        *_window_rows(camera.window.aperture_diameter_mm),
+    ]
+
+
+def _window_rows(aperture_mm: float) -> list[DesignRow]:
+    """Return the thickness of a window of each material with a known strength, for the pressure at 100 m."""
+    return [
+        DesignRow(
+            f"{name} window for 1 MPa, clamped",
+            window_thickness_mm(pressure_mpa=1.0, unsupported_diameter_mm=aperture_mm, strength_mpa=glass.strength_mpa),
+            "mm",
+            f"Eq. 3.2, safety factor 4, {glass.strength_mpa:g} MPa ({glass.strength_source})",
+        )
+        for name, glass in GLASSES.items()
+        if glass.strength_mpa is not None
+    ]
+
+
+def format_table(rows: list[DesignRow]) -> list[str]:
+    """Format the table as lines of text; the last line names the window materials of unknown strength."""
+    width = max(len(row.name) for row in rows)
+    unknown = ", ".join(name for name, glass in GLASSES.items() if glass.strength_mpa is None)
+    return [
+        *(f"{row.name:<{width}}  {row.value:>8.4g} {row.unit:<5}  {row.source}" for row in rows),
+        f"without a thickness: {unknown}, because no strength with a source is known; ask its maker",
+    ]

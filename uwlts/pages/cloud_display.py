@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from uwlts.pages.cloud_figure import LIMIT_STD, PARTS, CloudField, CloudPoints, colour_limit_mm
-from uwlts.pages.numbers import unit_for
-from uwlts.pages.toolkit import FigureCollector, render_page, write_page
+from uwlts.pages.toolkit import FigureCollector, render_page, unit_for, write_page
 
 MOST_SHOWN = 200_000
 """Largest number of points in a view of its own: about 1 MB, which every browser turns without delay."""

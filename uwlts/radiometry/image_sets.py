@@ -11,13 +11,13 @@ import numpy as np
 
 from uwlts.errors import CaptureError, ImageError
 from uwlts.files.reading import is_regular_file
-from uwlts.model.clipped import split_clipped
 from uwlts.model.library import load_sensor, validate_description
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import CAPTURES, Capture
 from uwlts.storage.data_set import CARD, load_dataset
 from uwlts.storage.image_file import SUFFIXES, read_image
 from uwlts.stripe import PeakRule, StripeOptions, StripeSettings, extract_stripe
+from uwlts.stripe.exposures import split_clipped
 
 _BITS = (8, 10, 12, 14, 16)
 """Bits of cameras."""

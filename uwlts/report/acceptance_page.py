@@ -11,7 +11,6 @@ from uwlts.acceptance.acceptance_plan import SYMBOLS, CertifiedArtefact, Symbol
 from uwlts.acceptance.characteristics import NAMES, RULES, Characteristic, CharacteristicValue
 from uwlts.files.json_files import json_text
 from uwlts.model.artefacts import SphereStandard, StepStandard
-from uwlts.pages.numbers import format_fixed
 from uwlts.pages.toolkit import (
     BLUE,
     COLOURS,
@@ -20,6 +19,7 @@ from uwlts.pages.toolkit import (
     RED,
     SOFT,
     figure_svg,
+    format_fixed,
     legend_below,
     new_figure,
     plain_text,

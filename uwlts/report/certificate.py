@@ -26,8 +26,7 @@ from uwlts.model.calibration import Calibration
 from uwlts.model.joint_estimate import ImageFit
 from uwlts.model.parameter_keys import ParameterKey, WindowParameter, parse_parameter
 from uwlts.model.sensor import Description, Medium
-from uwlts.pages.numbers import format_to_scale, numbers_in
-from uwlts.pages.toolkit import MISSING
+from uwlts.pages.toolkit import MISSING, format_to_scale, numbers_in
 from uwlts.report.certificate_volume import (
     CalibrationInUse,
     LengthUncertainty,

@@ -17,12 +17,13 @@ from uwlts.files.writing import refuse_unsuitable, write_atomically
 from uwlts.model.calibration import Calibration
 from uwlts.model.joint_estimate import ImageFit, Origin
 from uwlts.model.parameter_keys import ParameterKey
-from uwlts.pages.numbers import format_fixed, format_to_scale
 from uwlts.pages.toolkit import (
     COLOURS,
     INK,
     MISSING,
     figure_svg,
+    format_fixed,
+    format_to_scale,
     legend_below,
     new_figure,
     refuse_unsuitable_page,

@@ -29,13 +29,13 @@ from uwlts.inspection.features import (
 from uwlts.inspection.inspect import InspectionKind, inspect_cloud
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.sensor import Table
-from uwlts.pages.numbers import format_to_scale
 from uwlts.pages.toolkit import (
     INK,
     MISSING,
     RED,
     Tile,
     figure_png,
+    format_to_scale,
     new_figure,
     png_data_uri,
     refuse_unsuitable_page,
@@ -43,15 +43,17 @@ from uwlts.pages.toolkit import (
     write_page,
 )
 from uwlts.report.certificate import check_certificate
-from uwlts.report.findings_order import (
+from uwlts.report.measured_values import (
+    COLUMNS,
     FindingOrder,
+    MeasuredValues,
     format_place,
     judge_feature,
     load_order,
+    read_measured,
     resolve_datum,
     sort_by_severity,
 )
-from uwlts.report.measured_values import COLUMNS, MeasuredValues, read_measured
 from uwlts.report.plot import DEVIATIONS, surface_limit_mm
 from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.cloud import PointCloud

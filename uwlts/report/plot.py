@@ -21,8 +21,18 @@ from uwlts.argument_types import check_arguments
 from uwlts.errors import ImageError
 from uwlts.model.calibration import Calibration
 from uwlts.pages.cloud_figure import AZIMUTH_DEG, ELEVATION_DEG, STOPS, CloudField, colour_limit_mm, view_direction
-from uwlts.pages.numbers import entries_of, number_list, split_name, unit_for, unit_of
-from uwlts.pages.toolkit import BLUE, INK, make_figure, new_figure, plain_text
+from uwlts.pages.toolkit import (
+    BLUE,
+    INK,
+    entries_of,
+    make_figure,
+    new_figure,
+    number_list,
+    plain_text,
+    split_name,
+    unit_for,
+    unit_of,
+)
 from uwlts.storage.capture import Frame
 from uwlts.storage.cloud import PointCloud
 from uwlts.stripe import Stripe

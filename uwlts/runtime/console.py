@@ -17,8 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from uwlts.argument_types import protect_inputs
 from uwlts.errors import DescriptionWarning, Error, make_printable
-from uwlts.runtime.interrupts import preserve_interrupts
-from uwlts.runtime.progress import ProgressListener, ignore_progress
+from uwlts.runtime.progress import ProgressListener, ignore_progress, preserve_interrupts
 
 USER_ERROR, INTERRUPTED = 2, 130
 SWITCHES = {

@@ -28,8 +28,8 @@ from typing import Any, Literal, TypeVar, assert_never
 
 from uwlts.errors import Error, SetupError
 from uwlts.files.writing import remove_incomplete
-from uwlts.runtime.interrupts import preserve_interrupts
 from uwlts.runtime.optional_library import pip_install, read_requirements
+from uwlts.runtime.progress import preserve_interrupts
 
 Item = TypeVar("Item")
 Job = TypeVar("Job")

@@ -14,7 +14,7 @@ from uwlts.fitting.least_squares import (
     principal_axes,
     thin_evenly,
 )
-from uwlts.shapes.circle import fit_algebraic_centres, initial_centre, prepare_round, unit_vectors
+from uwlts.shapes.flat import fit_algebraic_centres, initial_centre, prepare_round, unit_vectors
 
 _THINNED = 600
 """Number of points for the search of a cylinder axis."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import robust_std
-from uwlts.shapes.circle import Circle
+from uwlts.shapes.flat import Circle
 
 LEAST_POINTS = 12
 """Points on the artefact that a profile needs: four for each of a circle's three parameters."""

@@ -17,8 +17,8 @@ from uwlts.fitting.least_squares import (
     parameter_covariance,
     robust_std,
 )
-from uwlts.fitting.point_spacing import number_cubes
-from uwlts.shapes.circle import fit_algebraic_centres, initial_centre, prepare_round, unit_vectors
+from uwlts.fitting.local_surface import number_cubes
+from uwlts.shapes.flat import fit_algebraic_centres, initial_centre, prepare_round, unit_vectors
 
 LEAST_POINTS = 50
 """Least number of points of a sphere."""

@@ -2,9 +2,9 @@
 
 A profile line is an image row if the stripe runs along the image height, an image column if it runs along the width.
 
-The steps: `block_contrast` finds places on each line that may contain a stripe. `search` examines these places by the
-rules for several peaks. `peak_window` measures each peak, `methods` locate its centre, and `extract` combines all steps
-and assigns a status to each line. `direct` separates the laser's own stripe from reflections. `capture_stripes`
+The steps: `extract` finds places on each line that may contain a stripe. `search` examines these places by the rules
+for several peaks. `peak_window` measures each peak, `methods` locate its centre, and `extract` combines all steps and
+assigns a status to each line. `direct` separates the laser's own stripe from reflections. `capture_stripes`
 processes all laser images of a capture and explains missing stripes.
 """
 

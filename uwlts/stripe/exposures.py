@@ -1,7 +1,12 @@
-"""Fusion of images of one place at several exposures, for faint and bright surfaces in one image.
+"""Fusion of images of one place at several exposures, and marks of clipped pixels in images calculated from others.
 
 If black rubber and shining steel are both in view, no exposure shows both without darkness or saturation. Images of one
 place at increasing exposures form a bracket. Their fused image has the grey values of the longest exposure.
+
+A pixel that the camera clipped has no known light. Subtracted backgrounds and formulas of channels may give it any grey
+value. Such an image has a ``saturation_dn`` of 2^k - 1, and 2^k is added to its clipped pixels. Thus the marks travel
+with the image through captures, exports and cuts, and clipped pixels are not below ``saturation_dn`` in any image.
+Images from cameras of k bits have no grey values above 2^k - 1, which are marks only.
 """
 
 from __future__ import annotations
@@ -12,9 +17,31 @@ from typing import Protocol
 
 import numpy as np
 
-from uwlts.model.clipped import split_clipped
 from uwlts.model.sensor import LEAST_BRACKET_STEP, MOST_IN_BRACKET, CaptureHeader
 from uwlts.model.stripe import Stripe
+
+
+def mark_clipped(image: np.ndarray, clipped: np.ndarray, *, saturation_dn: int) -> np.ndarray:
+    """Return grey values (H, W), limited to 0 to ``saturation_dn``, as uint16 with marks where ``clipped`` (H, W).
+
+    ``saturation_dn`` is 2^k - 1, at most 2^15 - 1.
+    """
+    return np.clip(image, 0, saturation_dn).astype(np.uint16) + np.uint16(saturation_dn + 1) * clipped
+
+
+def has_marks(image: np.ndarray, saturation_dn: float) -> bool:
+    """Return whether an image (H, W) has marks of clipped pixels."""
+    mark = saturation_dn + 1
+    can = image.dtype == np.uint16 and mark <= 2**15 and mark == int(mark) and int(mark).bit_count() == 1
+    return can and bool(image.max() >= mark)
+
+
+def split_clipped(image: np.ndarray, saturation_dn: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the grey values (H, W) of an image without marks, and whether each pixel was clipped (H, W)."""
+    clipped = image >= saturation_dn
+    if has_marks(image, saturation_dn):
+        image = image & np.uint16(saturation_dn)
+    return image, clipped
 
 
 class _Rule:
@@ -130,7 +157,7 @@ def fuse_exposures(
     The offset is estimated from the background of the shortest and the longest image. Cameras expose some microseconds
     longer or shorter than they report. T / t is therefore estimated from pixels that are well exposed in both images.
     """
-    # Clipped pixels of differences have any grey value (`uwlts.model.clipped`).
+    # Clipped pixels of differences have any grey value (`mark_clipped`).
     known = (split_clipped(image, full_dn) for image in images)
     pixels = [np.where(clipped, full_dn, values).astype(np.float32) for values, clipped in known]
     offset = _estimate_offset(pixels[0], pixels[-1], float(exposure_ms[-1] / exposure_ms[0]))

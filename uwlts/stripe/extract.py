@@ -1,23 +1,150 @@
-"""Extraction of one stripe centre per profile line from an image."""
+"""Extraction of one stripe centre per profile line from an image.
+
+A frame is reduced to the maximum and the background of blocks of a few pixels along each line. This is the only
+operation on all pixels.
+
+The contrast of a block is its maximum minus the larger background of the two blocks two steps away. Thus neither an
+edge between a dark and a bright region nor a slope has contrast. Hot pixels or a second stripe in the surroundings do
+not reduce the contrast of a stripe.
+
+G. S. de Matos (UFSC 2017, section 4.5) applies a 5x5 low-pass filter and a quadratic "every few columns". The filter
+IMAQ LowPass replaces a pixel by the mean of its neighbours only if it differs from them by more than a tolerance
+(default: 40 %); it is not a plain mean. "Every few columns" is interpreted as five pixels, the size of the filter.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from statistics import NormalDist
 
 import cv2
 import numpy as np
 
 from uwlts.errors import ImageError
-from uwlts.model.clipped import has_marks, split_clipped
 from uwlts.model.stripe import Stripe, StripeCandidates, StripeStatus
-from uwlts.stripe.block_contrast import MEDIAN_SURROUNDINGS, block_contrast, block_extremes, noise_from_contrast
+from uwlts.runtime.compiled import compiled
 from uwlts.stripe.direct import direct_stripe
-from uwlts.stripe.low_pass import fit_low_passed
+from uwlts.stripe.exposures import has_marks, split_clipped
 from uwlts.stripe.methods import method_names, place_centre
 from uwlts.stripe.options import PeakRule, StripeOptions
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA, noise_gain
 from uwlts.stripe.search import MARGIN, SearchRules, mark_rivals, search_all, search_profiles, search_rules
+
+_NOISE_SAMPLES = 1024
+"""Number of blocks for the estimate of the noise."""
+
+MEDIAN_SURROUNDINGS = NormalDist().inv_cdf(1.0 - (1.0 - math.sqrt(0.5)) ** 0.5)
+"""Median of max(min(a, b), min(c, d)) for unit Gaussian noise: each minimum is below x with 1 - (1 - P(x))^2."""
+
+
+def block_extremes(profiles: np.ndarray, block: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the maximum and the background of each block of profiles (N, L), as two arrays (ceil(N / block), L).
+
+    The background is the smaller of two pixels half a block apart, which a single hot pixel does not raise. The last
+    block of a line may be smaller.
+    """
+    high, low = np.empty((2, math.ceil(profiles.shape[0] / block), profiles.shape[1]), profiles.dtype)
+    _fill_extremes(profiles, block, high, low)
+    return high, low
+
+
+@compiled
+def _fill_extremes(profiles: np.ndarray, block: int, high: np.ndarray, low: np.ndarray) -> None:
+    """Fill the extremes of `block_extremes` in the order of the pixels in memory, which limits the speed."""
+    count = profiles.shape[0]
+    for first in range(0, count, block):
+        largest, least = high[first // block], low[first // block]
+        middle = first + min(block, count - first) // 2
+        for n in range(first, min(first + block, count)):
+            pixels = profiles[n]
+            if n == first:
+                for k in range(pixels.size):
+                    largest[k] = least[k] = pixels[k]
+            elif n == middle:
+                for k in range(pixels.size):
+                    largest[k], least[k] = max(largest[k], pixels[k]), min(least[k], pixels[k])
+            else:
+                for k in range(pixels.size):
+                    largest[k] = max(largest[k], pixels[k])
+
+
+def block_contrast(high: np.ndarray, low: np.ndarray, *, out: np.ndarray) -> np.ndarray:
+    """Return the non-negative height of each block above its surroundings, grey levels; arrays as in `block_extremes`.
+
+    At the ends of a line only one side has surroundings, which are used alone.
+    """
+    surroundings = np.empty_like(low)
+    np.maximum(low[:-4], low[4:], out=surroundings[2:-2])
+    surroundings[:2] = low[2:4]
+    surroundings[-2:] = low[-4:-2]
+    # OpenCV's difference of unsigned integers saturates at 0.
+    cv2.subtract(high, surroundings, dst=out)
+    return out if out.dtype.kind == "u" else np.maximum(out, 0, out=out)
+
+
+def noise_from_contrast(contrast: np.ndarray, block: int) -> float:
+    """Estimate the standard deviation of the background noise per pixel, grey levels.
+
+    The median contrast of all blocks is divided by its value for unit Gaussian noise. Most blocks do not contain a
+    stripe. For a background clipped at black, this estimate is more accurate than the deviation of single pixels.
+    """
+    sample = contrast.ravel()[:: max(1, contrast.size // _NOISE_SAMPLES)].copy()
+    sample.partition(sample.size // 2)
+    middle = sample[sample.size // 2]
+    median = float(middle)
+    if contrast.dtype.kind in "iu":
+        # The median of integers is quantised: interpolate the cumulative histogram linearly.
+        below, equal = np.count_nonzero(sample < middle), np.count_nonzero(sample == middle)
+        median += (0.5 * sample.size - below) / equal - 0.5
+    return max(median, 0.0) / _median_contrast(block)
+
+
+@lru_cache
+def _median_contrast(block: int) -> float:
+    """Return the median contrast of a block of unit Gaussian noise."""
+    return NormalDist().inv_cdf(0.5 ** (1.0 / block)) - MEDIAN_SURROUNDINGS
+
+
+_SIZE_PX = 5  # of the window of the thesis's filter
+_SEARCHED_PX = 8
+"""Half width of the window around the stripe in which its peak is searched."""
+
+
+def fit_low_passed(profiles: np.ndarray, stripe: Stripe, *, tolerance: float, fitted_px: int) -> Stripe:
+    """Return the stripe with the centres of the low-passed profiles (N, L), position first, on the same lines.
+
+    ``tolerance`` is that of the filter; 0 makes it a mean of the neighbours. ``fitted_px`` is an odd number.
+    """
+    smooth, centre = apply_low_pass(profiles, tolerance=tolerance), stripe.centre_px.copy()
+    lines = stripe.lines
+    centre[lines] = _peaks(smooth, lines, centre[lines], half=fitted_px // 2)
+    return replace(stripe, centre_px=centre)
+
+
+def apply_low_pass(image: np.ndarray, *, tolerance: float) -> np.ndarray:
+    """Filter an image (H, W) with IMAQ LowPass of 5x5 pixels; return float32."""
+    grey = image.astype(np.float32)
+    count = _SIZE_PX**2
+    neighbours = (cv2.blur(grey, (_SIZE_PX, _SIZE_PX)) * count - grey) / (count - 1)
+    return np.where(np.abs(grey - neighbours) > tolerance * neighbours, neighbours, grey)
+
+
+def _peaks(smooth: np.ndarray, line: np.ndarray, near_px: np.ndarray, *, half: int) -> np.ndarray:
+    """Return vertices (N,) of parabolas through pixels around the maximum of columns (N,) near rows (N,)."""
+    # On a plateau, the maximum nearest to the stripe's position is used.
+    around = np.array(sorted(range(-_SEARCHED_PX, _SEARCHED_PX + 1), key=abs))
+    rows = np.clip(np.rint(near_px).astype(int)[:, None] + around, 0, len(smooth) - 1)
+    top = rows[np.arange(len(line)), smooth[rows, line[:, None]].argmax(axis=1)]
+    offset = np.arange(-half, half + 1)
+    rows = np.clip(top[:, None] + offset, 0, len(smooth) - 1)
+    # Relative to the maximum, so that a plateau is exactly zero. It has no vertex; its position is used instead.
+    below = smooth[rows, line[:, None]] - smooth[top, line][:, None]
+    second, first, _ = np.linalg.pinv(np.vander(offset, 3)) @ below.T
+    vertex = np.where(second < 0, -first / np.where(second < 0, 2 * second, 1.0), 0.0)
+    return top + np.clip(vertex, -half, half)
+
 
 _LARGEST = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0, np.dtype(np.float32): math.inf}
 """Largest grey value of each type."""
@@ -69,7 +196,7 @@ def extract_stripe(
         case.
     saturation : float, optional
         Grey value of clipped pixels. By default the largest value of the integer type, none for float32. It is
-        needed for 10- or 12-bit images in uint16. Values above 2^k - 1 are marks (`uwlts.model.clipped`).
+        needed for 10- or 12-bit images in uint16. Values above 2^k - 1 are marks (`uwlts.stripe.exposures`).
 
     Returns
     -------

@@ -65,7 +65,7 @@ class StripeOptions:
         Lines omitted on either side of an end of the stripe, or of a jump by more than half of `half_window_px` between
         lines: at an edge or limb only a part of the sheet's width meets the surface. 0 keeps these lines.
     low_pass : float, optional
-        Tolerance of the thesis's low-pass filter (`uwlts.stripe.low_pass`), 0.4 for LabVIEW's, 0 for a plain mean. The
+        Tolerance of the thesis's low-pass filter (`uwlts.stripe.extract`), 0.4 for LabVIEW's, 0 for a plain mean. The
         centres found by `method` are then replaced by those of a quadratic through `low_pass_fit_px` filtered pixels,
         an odd number.
     """

@@ -7,10 +7,8 @@ detectors are in the subpackage ``detection``, which is imported when a target i
 from importlib import import_module
 from pkgutil import iter_modules
 
-from uwlts.targets.charuco import CharucoTarget
-from uwlts.targets.chessboard import ChessboardTarget
-from uwlts.targets.circle_grid import CircleGridTarget
-from uwlts.targets.circles import CircleTarget
+from uwlts.targets.chessboard import CharucoTarget, ChessboardTarget
+from uwlts.targets.circles import CircleGridTarget, CircleTarget
 from uwlts.targets.target import Patch, Target, TargetView, parse_target
 
 __all__ = [

@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from twin.datasets.data_set import DataSetDescription, LogUniform, Normal, OneOf, Uniform, load_description
-from twin.datasets.draws import choose_split, draw_scene
+from twin.datasets.generation import choose_split, draw_scene
 from uwlts.errors import DescriptionError
 from uwlts.model.library import list_names
 from uwlts.storage.data_set import SPLITS

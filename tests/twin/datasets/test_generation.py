@@ -19,7 +19,7 @@ import webdataset
 import twin
 from tests.virtual_sensors import altered
 from twin.datasets.data_set import DataSetDescription
-from twin.datasets.draws import draw_scene
+from twin.datasets.generation import draw_scene
 from uwlts.errors import ArgumentError, CaptureError, DescriptionError, DesignError, OutputError
 from uwlts.files.json_files import json_text
 from uwlts.files.writing import hash_file

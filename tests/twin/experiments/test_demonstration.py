@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from twin.experiments.demonstration import METHODS, demo
+from twin.experiments.reproduce import DEMO_METHODS, demo
 from twin.scene.campaign import list_takes, load_campaign
 from uwlts.errors import OutputError
 
@@ -18,4 +18,6 @@ def test_a_folder_that_cannot_be_used_ends_the_demo_before_rendering(tmp_path: P
 
 def test_the_campaign_records_what_the_calibrations_use():
     recorded = {take.name for take in list_takes(load_campaign("demo"), seed=0)}
-    assert recorded >= {name for each in METHODS for names in (each.scans, *each.evidence.values()) for name in names}
+    assert recorded >= {
+        name for each in DEMO_METHODS for names in (each.scans, *each.evidence.values()) for name in names
+    }

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from twin.experiments.published import MEAN, PublishedFigure, draw_means, load_published, select_means, state_agreement
+from twin.experiments.figures import MEAN, PublishedFigure, draw_means, load_published, select_means, state_agreement
 from twin.experiments.reproduce import THESIS_METHODS
 from twin.scene.campaign import list_takes, load_campaign
 from uwlts.errors import DescriptionError

@@ -9,7 +9,7 @@ import pytest
 
 from tests.virtual_sensors import altered, clear, plate, scene_of, sensor_at
 from twin.datasets.data_set import DataSetDescription, load_description
-from twin.datasets.draws import draw_scene
+from twin.datasets.generation import draw_scene
 from twin.datasets.labels import make_labels
 from twin.light.pose import SensorPose
 from twin.light.renderer import Renderer

@@ -28,7 +28,7 @@ from twin.light.renderer import Renderer
 from twin.light.sheet import PowerTable, Sheet
 from twin.recording.frame_truth import find_true_stripe, measure_line_light
 from twin.rendering_options import NONE, Flaws
-from twin.sensor.flaws import as_built
+from twin.sensor.detector import as_built
 from uwlts.errors import DescriptionError, DesignError
 from uwlts.model.library import validate_description
 from uwlts.model.placement import camera_from_object

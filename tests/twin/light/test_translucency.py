@@ -13,7 +13,7 @@ from twin.light.renderer import Renderer
 from twin.recording.frame_truth import find_true_stripe
 from twin.rendering_options import NONE
 from twin.scene.scene_object import Pose
-from twin.scene.subsurface import lateral_spread
+from twin.scene.surfaces import lateral_spread
 from uwlts.model.sensor import Sensor
 
 PATH = 0.4

@@ -15,7 +15,7 @@ from twin.recording.sensor_simulator import SensorSimulator, with_window
 from twin.rendering_options import NONE, Options
 from twin.scene.description import CirclePlate, Scene
 from twin.scene.finish import draw_print_errors
-from twin.scene.motion import Motion, Shot
+from twin.scene.platforms import Motion, Shot
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture
 from uwlts.storage.truth import TruthStatus, read_truth, truth_path

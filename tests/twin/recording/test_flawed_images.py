@@ -7,12 +7,12 @@ import pytest
 
 from tests.virtual_sensors import altered, camera_axes, clear, cropped, oracle_paths, plate, scene_of, sensor_at
 from twin.light.camera import CameraView
-from twin.light.lamp_ring import RING_MM, reflect_ring
+from twin.light.illumination import RING_MM, reflect_ring
 from twin.light.renderer import Renderer
 from twin.recording.record_scene import record_scene
 from twin.recording.sensor_simulator import SensorSimulator
 from twin.rendering_options import NONE, Flaws, Options
-from twin.sensor.flaws import dirt
+from twin.sensor.detector import dirt
 from uwlts.errors import DescriptionError
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture

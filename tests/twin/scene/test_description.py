@@ -9,8 +9,8 @@ from twin.light.renderer import Renderer
 from twin.recording.sensor_simulator import check_scene
 from twin.rendering_options import Options
 from twin.scene.description import Scene, load_scene, medium_of
-from twin.scene.motion import Motion
 from twin.scene.objects import Objects, build_objects
+from twin.scene.platforms import Motion
 from twin.scene.scene_object import Pose
 from uwlts.errors import DescriptionError, RangeError
 from uwlts.model.library import library_folder, list_names, load_sensor

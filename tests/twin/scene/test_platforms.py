@@ -4,11 +4,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from twin.scene.guide_and_table import LinearGuide, RotaryTable
+from twin.scene.platform_kinds import (
+    LinearGuide,
+    Navigation,
+    Robot,
+    RotaryTable,
+    Sea,
+    Vehicle,
+    sample_waves,
+    simulate_drift,
+)
 from twin.scene.platforms import IdealPath
-from twin.scene.robot import Robot
 from twin.scene.scene_object import Pose
-from twin.scene.vehicle import Navigation, Sea, Vehicle, sample_waves, simulate_drift
 from uwlts.errors import DescriptionError
 from uwlts.model.trajectory import Trajectory
 from uwlts.storage.pose_files import read_trajectory

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import tomli_w
 
-from twin.scene.campaign import Campaign, list_takes, load_campaign, replace_values
+from twin.scene.campaign import Campaign, Understated, find_understated, list_takes, load_campaign, replace_values
 from twin.scene.description import Block
-from twin.scene.stated_deviations import Understated, find_understated
 
 SCALED = {
     "window_tilt_deg": "window_tilt_std_deg",

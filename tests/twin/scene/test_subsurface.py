@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from twin.scene.subsurface import internal_reflectance, lateral_spread
+from twin.scene.surfaces import internal_reflectance, lateral_spread
 
 CASES = [(0.3, 0.7, 1.0), (0.3, 0.5, 1.157), (1.0, 0.12, 1.0), (0.1, 0.9, 1.1)]
 

@@ -9,7 +9,7 @@ from PIL import Image
 
 from tests.virtual_sensors import altered
 from twin.rendering_options import Flaws
-from twin.sensor.flaws import GLARE_REACH, add_glare, as_built, deliver_image, laser_shares, vignette
+from twin.sensor.detector import GLARE_REACH, add_glare, as_built, deliver_image, laser_shares, vignette
 from uwlts.errors import DescriptionError
 
 

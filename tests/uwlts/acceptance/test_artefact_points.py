@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from uwlts.acceptance.artefact_points import measure_plane, measure_spheres, measure_step_height
+from uwlts.acceptance.characteristics import measure_plane, measure_spheres, measure_step_height
 from uwlts.errors import EvaluationError
 from uwlts.model.artefacts import PlaneStandard, SphereStandard, StepStandard
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from uwlts.acceptance.accept import check_requirements, count_different
 from uwlts.acceptance.acceptance_plan import AcceptancePlan
 from uwlts.acceptance.characteristics import CharacteristicValue
-from uwlts.acceptance.requirements import check_requirements, count_different
 
 DIAGONAL_MM = 300.0
 

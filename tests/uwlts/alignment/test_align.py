@@ -9,8 +9,8 @@ import pytest
 import uwlts
 from tests.uwlts.path_views import ride
 from uwlts.alignment.align import AlignedTrajectory, Crossing
-from uwlts.alignment.alignment_options import AlignmentOptions
 from uwlts.alignment.crossing_search import correlate_heights
+from uwlts.alignment.pieces import AlignmentOptions
 from uwlts.cli import app
 from uwlts.model.trajectory import Trajectory
 from uwlts.storage.cloud import PointCloud

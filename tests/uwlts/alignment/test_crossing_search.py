@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from uwlts.alignment.align import _make_crossing
-from uwlts.alignment.alignment_options import AlignmentOptions
 from uwlts.alignment.crossing_search import (
     _find_hypotheses,
     _has_rival,
@@ -18,17 +17,16 @@ from uwlts.alignment.crossing_search import (
     accept_hypothesis,
     correlate_heights,
 )
-from uwlts.alignment.drift_model import DriftModel
-from uwlts.alignment.path_estimate import PathEstimate
-from uwlts.alignment.path_prior import PathPrior
+from uwlts.alignment.path_prior import DriftModel, PathPrior
 from uwlts.alignment.path_solution import (
+    PathEstimate,
     _linearise_pair,
     _observable_projection,
     initial_estimate,
     refine_nodes,
     settle,
 )
-from uwlts.alignment.pieces import Survey
+from uwlts.alignment.pieces import AlignmentOptions, Survey
 from uwlts.errors import EvaluationError
 from uwlts.fitting.patches import distances_between, rigid_derivatives
 from uwlts.model.trajectory import Trajectory

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwlts.alignment.drift_model import RATES, DriftModel, candidates_beside, choose_drift_model
+from uwlts.alignment.path_prior import RATES, DriftModel, candidates_beside, choose_drift_model
 from uwlts.errors import EvaluationError
 from uwlts.model.trajectory import Trajectory
 

@@ -5,8 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from uwlts.alignment.drift_model import DriftModel
-from uwlts.alignment.path_prior import PathPrior
+from uwlts.alignment.path_prior import DriftModel, PathPrior
 from uwlts.model.trajectory import Trajectory
 
 SECONDS, SPEED_MM_S = 20.0, 200.0

@@ -6,13 +6,13 @@ import pytest
 from tests.uwlts.calibration_views import built_sensor, lattice, stage_images, stripes_on_target
 from tests.uwlts.joint_views import TARGET, gathered
 from tests.virtual_sensors import altered
+from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.camera.lens import LensChoice
 from uwlts.calibration.capture_evidence import AirEvidence
 from uwlts.calibration.joint.gathering import Series
 from uwlts.calibration.joint.parameters import ViewMedium
-from uwlts.calibration.joint.procedure import solve_jointly
-from uwlts.calibration.moved_sheet import find_step
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, Evidence, solve
+from uwlts.calibration.target_stripes import find_step
 
 BARE = altered(built_sensor(), {"camera": {"window": {"mounted": False}}})
 OPTIONS = CalibrationOptions(correct_circles=False, poses="stage", lens=LensChoice())

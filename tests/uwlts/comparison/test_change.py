@@ -16,7 +16,7 @@ from uwlts.comparison.change_reference import read_reference, sample_mesh
 from uwlts.comparison.ideal_shapes import IdealCylinder, IdealPlane, IdealSphere, place_shape
 from uwlts.comparison.local_means import ComparisonOptions
 from uwlts.errors import CaptureError, DescriptionError, EvaluationError, OutputError
-from uwlts.fitting.point_spacing import number_cubes
+from uwlts.fitting.local_surface import number_cubes
 from uwlts.registration.surface_registration import SurfaceSample, register_to_surface
 from uwlts.storage.cloud import STEP, WATER, PointCloud, PointUncertainty
 from uwlts.storage.ply import read_ply

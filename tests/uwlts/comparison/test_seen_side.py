@@ -6,7 +6,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 import uwlts
-from uwlts.comparison.seen_side import orient_triangles
+from uwlts.comparison.change_reference import orient_triangles
 from uwlts.storage.cloud import make_foreign_cloud
 
 NOISE_MM = 0.02

@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from uwlts.desk.plot_view import Plot, ticks
+from uwlts.desk.measure_panel import Plot, ticks
 
 
 @pytest.mark.parametrize("low, high", [(0.0, 1.0), (-0.05, 0.31), (380.0, 400.2), (-3e-4, 2e-4), (0.0, 1.3e6)])

@@ -15,10 +15,10 @@ from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import MEDIUM, Noise, gathered, target_series
 from tests.waiting import within
 from twin.devices.grbl_controller import GrblController
-from uwlts.calibration.joint.procedure import solve_jointly
+from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.desk import ros_node
-from uwlts.desk.scan_service import ScanService
+from uwlts.desk.scan import ScanService
 from uwlts.errors import CalibrationError, HardwareError
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.replay import ReplayCamera

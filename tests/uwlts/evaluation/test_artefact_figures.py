@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.artefact_figures import evaluate_cloud
-from uwlts.evaluation.truth_comparison import compare_with_truth
+from uwlts.evaluation.figures import compare_with_truth
 from uwlts.model.artefacts import Artefact, PipeStandard, PlaneStandard, SphereStandard, StepStandard
 from uwlts.shapes.sphere import _propose_centres
 from uwlts.shapes.step import StepFace, label_step_faces, step_height

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.evaluate import Evaluation, evaluate
-from uwlts.evaluation.truth_comparison import TruthComparison
+from uwlts.evaluation.figures import TruthComparison
 from uwlts.model.library import load_sensor
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.truth import Truth, TruthHeader, scene_digest, write_truth

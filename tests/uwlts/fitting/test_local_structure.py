@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from uwlts.errors import EvaluationError
+from uwlts.fitting.local_surface import choose_disc_diameter, measure_spacing, project_footprint
 from uwlts.fitting.patches import find_disc_radius
-from uwlts.fitting.point_spacing import choose_disc_diameter, measure_spacing, project_footprint
 from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PointCloud
 
 

@@ -25,7 +25,7 @@ from uwlts.inspection.flat import _estimate_step_height, _Hole, _mask_inner_poin
 from uwlts.inspection.inspect import inspect_cloud
 from uwlts.inspection.pipe_form import PipeFormRule, fit_pipe, pipe_features
 from uwlts.inspection.weld import _find_toes
-from uwlts.shapes.circle import Circle
+from uwlts.shapes.flat import Circle
 from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PAIRS, PointCloud, PointUncertainty, make_foreign_cloud
 
 NOISE_MM, IMAGE_MM = 0.02, 0.004

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwlts.inspection.noisy_extremes import largest_mean
+from uwlts.inspection.bead_profiles import largest_mean
 
 NOISE, COUNT, TOGETHER, PAIRS = 0.08, 36, 5, 40
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import f as f_distribution
 
 from uwlts.errors import EvaluationError
-from uwlts.inspection.section import cut_section, measure_step, order_profile
+from uwlts.inspection.picking import cut_section, measure_step, order_profile
 from uwlts.storage.cloud import PointCloud, PointUncertainty
 
 HEIGHT_MM, DEPTH_MM = 3.0, 350.0

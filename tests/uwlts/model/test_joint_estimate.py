@@ -7,8 +7,8 @@ import pytest
 
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import Noise, gathered, target_series
+from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.joint.next_shot import rank_next_shots
-from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.stored_estimate import read_original_estimate
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError, CaptureError

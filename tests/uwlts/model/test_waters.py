@@ -10,7 +10,7 @@ from hypothesis import given, settings, strategies as st
 from pydantic import ValidationError
 
 from uwlts.errors import DescriptionError, RangeError
-from uwlts.model import waters
+from uwlts.model import media
 from uwlts.model.phase_functions import (
     KINDS,
     FournierForand,
@@ -100,7 +100,7 @@ TABLE_3 = {
 def test_every_row_of_a_types_scattering_follows_the_authors_model(name):
     small, large = TABLE_3[name]
     wavelengths = np.array(NODES_NM, float)
-    found = np.array([waters.find_water(f"jerlov-{name}").particles(w).scattering_per_m for w in wavelengths])
+    found = np.array([media.find_water(f"jerlov-{name}").particles(w).scattering_per_m for w in wavelengths])
     # Eq. 8 less the molecules. The amount is met to 2.4 % in the worst case, 1C. The wavelengths' rounding to three
     # digits, 0.5 % at 1.06 /m, is what a misread digit would stand out of.
     model = small * 1.513 * (400 / wavelengths) ** 1.7 + large * 0.3411 * (400 / wavelengths) ** 0.3
@@ -127,7 +127,7 @@ def test_jerlov_types_agree_with_measurements_as_far_as_is_known(name):
     assert 1 / 2.9 < b / MEASURED[name][1] < 2.9
 
 
-@pytest.mark.parametrize("water", waters.WATERS)
+@pytest.mark.parametrize("water", media.WATERS)
 def test_every_water_absorbs_and_scatters_over_the_whole_range(water):
     wavelengths = np.linspace(400, 700, 121)
     for kind in ({"kind": "fresh"}, {"kind": "sea", "salinity_g_kg": 35.0}):
@@ -169,7 +169,7 @@ def test_turbidity_rises_without_a_jump(turbidity, step, wavelength):
 
 
 def test_turbidity_has_equal_factors_above_clear_water():
-    values = [waters.particles_at(t, wavelength_nm=635.0).scattering_per_m for t in np.arange(2.0, 3.01, 0.125)]
+    values = [media.particles_at(t, wavelength_nm=635.0).scattering_per_m for t in np.arange(2.0, 3.01, 0.125)]
     ratios = [later / earlier for earlier, later in pairwise(values)]
     assert ratios == pytest.approx([ratios[0]] * 8, rel=1e-12)
 
@@ -225,7 +225,7 @@ def test_media_stored_before_there_were_named_waters_mean_the_same(stored):
 @settings(deadline=None)
 @given(
     which=st.one_of(
-        st.fixed_dictionaries({"water": st.sampled_from(list(waters.WATERS))}),
+        st.fixed_dictionaries({"water": st.sampled_from(list(media.WATERS))}),
         st.fixed_dictionaries({"turbidity": st.floats(0, 3)}),
     ),
     share=st.none() | st.floats(1e-4, 0.1),
@@ -259,18 +259,18 @@ def test_contradictory_entries_are_refused(wrong, message):
 
 
 @pytest.mark.parametrize("wavelength", [399.9, 700.1, math.nan, math.inf])
-@pytest.mark.parametrize("water", [name for name in waters.WATERS if name != "pure"])
+@pytest.mark.parametrize("water", [name for name in media.WATERS if name != "pure"])
 def test_waters_are_refused_outside_their_wavelengths(water, wavelength):
     with pytest.raises(RangeError, match="wavelength_nm"):
-        waters.find_water(water).particles(wavelength)
+        media.find_water(water).particles(wavelength)
 
 
 def test_names_and_turbidities_are_checked_where_they_are_used():
     with pytest.raises(DescriptionError, match="harbour"):
-        waters.find_water("muddy").particles(635.0)
+        media.find_water("muddy").particles(635.0)
     for turbidity in (-1e-9, 3.001, math.nan):
         with pytest.raises(RangeError, match="turbidity"):
-            waters.particles_at(turbidity, wavelength_nm=635.0)
+            media.particles_at(turbidity, wavelength_nm=635.0)
     for share in (0.9e-4, 0.11, math.nan):
         with pytest.raises(RangeError, match="backscatter_share"):
             FournierForand.of_backscatter(share)

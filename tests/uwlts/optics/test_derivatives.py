@@ -7,7 +7,7 @@ import pytest
 from uwlts.model.calibration import CameraModel, FanModel, SheetModel, WindowModel
 from uwlts.model.sensor import Distortion
 from uwlts.optics.camera import image_derivatives
-from uwlts.optics.sheet import sheet_surface
+from uwlts.optics.triangulation import sheet_surface
 from uwlts.optics.window import trace_derivatives, trace_window
 
 CAMERA = CameraModel(width_px=1280, height_px=1024, fx_px=2400.0, fy_px=2410.0, cx_px=650.0, cy_px=500.0)

@@ -14,7 +14,7 @@ from uwlts.errors import DesignError, RangeError
 from uwlts.model.placement import camera_from_object, laser_pose, view_of_sheet
 from uwlts.model.sensor import Sensor
 from uwlts.optics import design as g
-from uwlts.optics.design_table import design, format_table
+from uwlts.optics.nominal import design, format_table
 
 ANGLE = math.radians(35)
 STANDOFF = 265 / math.tan(ANGLE)

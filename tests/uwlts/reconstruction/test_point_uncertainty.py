@@ -7,8 +7,8 @@ import pytest
 
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import MEDIUM, Noise, gathered, target_series
+from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.joint.parameters import Prior
-from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.scanned_surfaces import SLOPES
 from uwlts.calibration.joint.stored_estimate import read_stored_estimate
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions

@@ -10,8 +10,8 @@ import pytest
 import uwlts
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import MEDIUM, Noise, gathered, target_series
+from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.joint.observability import SheetRegion, list_regions, project_sheet_points, read_region_estimate
-from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError, CaptureError, OutputError
 from uwlts.files.json_files import compute_seal, to_canonical_json

@@ -7,7 +7,7 @@ import pytest
 
 from uwlts.errors import EvaluationError
 from uwlts.inspection.features import Feature, FeatureKind, plain_value
-from uwlts.report.findings_order import (
+from uwlts.report.measured_values import (
     FindingDatum,
     FindingLimits,
     format_place,

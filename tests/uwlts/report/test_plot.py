@@ -17,8 +17,7 @@ from matplotlib.colors import to_hex
 from uwlts.model.library import load_sensor
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.pages.cloud_display import choose_points
-from uwlts.pages.numbers import format_fixed, format_to_scale
-from uwlts.pages.toolkit import figure_png, figure_svg
+from uwlts.pages.toolkit import figure_png, figure_svg, format_fixed, format_to_scale
 from uwlts.report import plot
 from uwlts.storage.cloud import PointCloud
 from uwlts.stripe import extract_stripe

@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import pytest
 
-from uwlts.runtime.interrupts import preserve_interrupts
+from uwlts.runtime.progress import preserve_interrupts
 
 
 def test_an_interrupt_within_a_callback_is_not_lost(capsys: pytest.CaptureFixture):

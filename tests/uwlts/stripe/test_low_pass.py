@@ -6,7 +6,7 @@ import pytest
 from uwlts.errors import RangeError
 from uwlts.model.stripe import Stripe
 from uwlts.stripe import StripeOptions, extract_stripe
-from uwlts.stripe.low_pass import apply_low_pass, fit_low_passed
+from uwlts.stripe.extract import apply_low_pass, fit_low_passed
 
 LINES, LENGTH = 40, 64
 

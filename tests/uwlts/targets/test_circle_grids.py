@@ -10,7 +10,7 @@ from tests.oracles.drawings import circles, draw, pinhole, pose, project_points
 from uwlts.calibration.camera.photographs import calibrate_camera
 from uwlts.errors import DescriptionError, TargetError
 from uwlts.targets import CircleGridTarget, parse_target
-from uwlts.targets.detection.ellipse_bias import circle_centre_bias
+from uwlts.targets.detection.ellipses import circle_centre_bias
 
 SIZE, CENTRE, FOCAL = (480, 384), (243.3, 188.2), 500.0
 RAYS = pinhole(FOCAL, CENTRE)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from uwlts.errors import RangeError
-from uwlts.targets.detection.ellipse_bias import circle_centre_bias
+from uwlts.targets.detection.ellipses import circle_centre_bias
 
 FOCAL, CENTRE = 2450.0, (639.5, 511.5)
 

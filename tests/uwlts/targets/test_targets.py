@@ -10,7 +10,7 @@ from uwlts.errors import DescriptionError, ImageError, TargetError
 from uwlts.targets import CharucoTarget, ChessboardTarget, CircleTarget, parse_target
 from uwlts.targets.detection import detect_lattice, find_circles, label_lattice
 from uwlts.targets.detection.blobs import _select_ellipses
-from uwlts.targets.detection.ellipse_bias import circle_centre_bias
+from uwlts.targets.detection.ellipses import circle_centre_bias
 
 PLATE = CircleTarget(
     spacing_x_mm=9.375, spacing_y_mm=9.372, diameter_mm=5.0, marker_diameter_mm=2.0, columns=15, rows=13, origin=(6, 5)

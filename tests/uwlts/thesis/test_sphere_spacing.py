@@ -27,7 +27,7 @@ from uwlts.model.sensor import Medium
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.storage.capture import Capture
 from uwlts.thesis import evaluate_thesis
-from uwlts.thesis.sphere_spacing import (
+from uwlts.thesis.thesis_figures import (
     SphereScan,
     mean_spacing_error,
     mm_per_px,

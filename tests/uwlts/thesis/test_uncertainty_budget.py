@@ -8,7 +8,7 @@ from hypothesis import given, settings, strategies as st
 from scipy import stats
 
 from uwlts.errors import RangeError
-from uwlts.thesis.uncertainty_budget import UNIFORM, UncertaintySource, combine
+from uwlts.thesis.thesis_figures import UNIFORM, UncertaintySource, combine
 
 # In mm. The table's first column is the uncertainty and its second the correction: so the standard uncertainties that
 # it prints follow from the first, and the sum of the second is the printed total correction.

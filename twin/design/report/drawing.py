@@ -1,20 +1,19 @@
-"""Scale drawing of a sensor: rays, windows, sheet and measuring volume in side view and front view.
+"""Scale drawing of a sensor: rays, windows, sheet and measuring volume in side view.
 
-The side view looks along the sheet, perpendicular to the camera's axis, so that the sheet is a line. The front view
-looks onto the sheet. The measuring volume follows from the formulas.
+The view is along the sheet, perpendicular to the camera's axis, so that the sheet is a line. The measuring volume
+follows from the formulas.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from twin.design.figures_of_merit import evaluate_field, find_depths_in_view
+from twin.design.figures_of_merit import evaluate_field
 from twin.design.report.study_tables import number_text
 from twin.design.sensor_arrays import SensorArrays, extract_parameters
 from uwlts.errors import DesignError
@@ -26,11 +25,9 @@ from uwlts.pages.toolkit import BLUE, INK, RED, SOFT, new_figure
 _BEYOND = 1.06
 """Length of drawn rays and sheet relative to the distance of the volume's far end."""
 _DEPTHS = 201
-"""Depths for the outline of the region that both camera and laser reach."""
+"""Depths at which the region that both camera and laser reach is searched."""
 _PLACES = 21
 """Points along the stripe at each depth."""
-_BORDER = 41
-"""Pixels along each side of the image."""
 # The description does not contain the housing: these sizes only indicate it.
 _HOUSING_MM = 42.0
 _WALL_MM = 5.0
@@ -75,25 +72,8 @@ class SideView:
         return [*self.edges, self.sheet, self.camera.housing, self.laser.housing, self.volume]
 
 
-@dataclass(frozen=True, eq=False)
-class FrontView:
-    """Sheet from the front; points are (along the stripe, along the laser's axis) from the fan's origin, in mm."""
-
-    laser: Module
-    fan: tuple[np.ndarray, ...]  # (K, 2) each; edges of the fan
-    borders: tuple[np.ndarray, ...]
-    """(N, 2) each; the image's four sides, projected onto the sheet; NaN if a ray misses the sheet."""
-    lines: np.ndarray
-    """(3, 2, 2); ends of the line at near end, middle and far end of the volume in view; NaN if nothing is in view."""
-    region: np.ndarray  # (N, 2); outline of the region that both camera and laser reach; can be empty
-
-    def outlines(self) -> list[np.ndarray]:
-        """Return lines (K, 2) for drawing the design behind another one; they enclose the whole view."""
-        return [*self.fan, *self.lines, self.laser.housing]
-
-
-def make_views(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
-    """Return the side view and front view of a sensor in a medium.
+def make_view(sensor: Sensor, medium: Medium) -> SideView:
+    """Return the side view of a sensor in a medium.
 
     Raises DesignError if the sheet does not cross the camera's axis in front of the window, or the laser points back to
     the camera; Error as for `twin.design.sensor_arrays.extract_numbers`.
@@ -112,13 +92,11 @@ def make_views(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
     frame = np.stack([pose.normal, np.cross(pose.axis, pose.normal), pose.axis], axis=1)
     lighting = _ModuleGeometry.from_description(sensor, sensor.laser.window, medium, pose.origin_mm, frame)
     lens = Lens.from_description(camera)
-    depths, low, high, shown, line = _reach(sensor, p, float((start - pose.origin_mm) @ pose.fan))
+    depths, reached = _reach(sensor, p)
     near, far = outer + depths[[0, -1]]
-    reached = np.isfinite(low)
 
     end = pose.origin_mm + _BEYOND * ((on_sheet(np.array([far]))[0] - pose.origin_mm) @ pose.axis) * pose.axis
-    angles = np.array([0.0, p.lit_from_rad.item(), p.lit_to_rad.item()])[:, None]
-    axis, *fan = lighting.rays(np.cos(angles) * pose.axis + np.sin(angles) * pose.fan, end, pose.axis)
+    (axis,) = lighting.rays(pose.axis[None], end, pose.axis)
 
     # The side view is along the sheet for any roll of the fan, with the laser on the positive side.
     sideways = math.hypot(*pose.normal[:2])
@@ -126,9 +104,9 @@ def make_views(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
     side_axes = np.array([[*across, 0.0], [0.0, 0.0, 1.0]])
     ahead = np.array([0.0, 0.0, 1.0])
     border = undistort_pixels(lens, _border_towards(camera, across))
-    side_view = SideView(
-        camera=seeing.project(side_axes, 0.0),
-        laser=lighting.project(side_axes, 0.0),
+    return SideView(
+        camera=seeing.project(side_axes),
+        laser=lighting.project(side_axes),
         pupil_mm=camera.focal_length_mm / camera.f_number,
         baseline_mm=math.hypot(*pose.origin_mm[:2]),
         edges=tuple(seeing.rays(border, far * _BEYOND * ahead, ahead) @ side_axes.T),
@@ -139,22 +117,6 @@ def make_views(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
         outer_mm=outer,
         angle_rad=math.atan2(abs(pose.normal[2]), sideways),
     )
-
-    front_axes = np.stack([pose.fan, pose.axis])
-    heights, shown = ((on_sheet(outer + at) - pose.origin_mm) @ pose.axis for at in (depths, shown))
-    low, high = (np.stack([y, heights], axis=1)[reached] for y in (low, high))
-    width, height = camera.width_px - 0.5, camera.height_px - 0.5
-    corners = np.array([(-0.5, -0.5), (width, -0.5), (width, height), (-0.5, height), (-0.5, -0.5)])
-    sides = [undistort_pixels(lens, np.linspace(a, b, _BORDER)) for a, b in pairwise(corners)]
-    borders = [seeing.rays(side, pose.origin_mm, pose.normal)[:, -1] for side in sides]
-    front = FrontView(
-        laser=lighting.project(front_axes, pose.origin_mm),
-        fan=tuple((edge - pose.origin_mm) @ front_axes.T for edge in fan),
-        borders=tuple((border - pose.origin_mm) @ front_axes.T for border in borders),
-        lines=np.stack([line, np.repeat(shown[:, None], 2, axis=1)], axis=2),
-        region=np.concatenate([low, high[::-1]]),
-    )
-    return side_view, front
 
 
 def _crossing_mm(pose: LaserPose, outer: float) -> float:
@@ -172,35 +134,13 @@ def _crossing_mm(pose: LaserPose, outer: float) -> float:
     return depth
 
 
-def _reach(sensor: Sensor, p: SensorArrays, aside: float) -> tuple[np.ndarray, ...]:
-    """Return the region that both camera and laser reach, and three lines to draw.
-
-    ``aside`` is the position of Y = 0 from the laser's axis, mm.
-
-    Returns
-    -------
-    depths : (N,)
-        Depths of the volume from the window.
-    low, high : (N,)
-        Ends of the reached part at each depth, from the laser's axis; NaN if there is none.
-    shown : (3,)
-        Depths of the lines to draw: near end, middle and far end of the volume in view.
-    line : (3, 2)
-        Ends of these lines.
-    """
+def _reach(sensor: Sensor, p: SensorArrays) -> tuple[np.ndarray, np.ndarray]:
+    """Return depths (N,) of the volume from the window, and where both camera and laser reach a part of the line."""
     places = np.linspace(-1, 1, _PLACES) * (1 - 1e-9)
     depths = np.linspace(sensor.volume.near_mm, sensor.volume.far_mm, _DEPTHS)
     with np.errstate(all="ignore"):
         f = evaluate_field(np, p, depths.reshape(1, -1, 1), places.reshape(1, 1, -1), reflectance=0.5)
-        near, far = find_depths_in_view(np, p)
-        shown = near + (far - near) * np.array([0.0, 0.5, 1.0]).reshape(1, -1, 1)
-        line = evaluate_field(np, p, shown, places[[0, -1]].reshape(1, 1, -1), reflectance=0.5).y_mm[0] + aside
-    y, inside = (np.broadcast_to(values, (1, _DEPTHS, _PLACES))[0] for values in (f.y_mm + aside, f.in_view))
-    reached = inside.any(axis=1)
-    low = np.where(reached, np.where(inside, y, np.inf).min(axis=1), np.nan)
-    high = np.where(reached, np.where(inside, y, -np.inf).max(axis=1), np.nan)
-    line = np.where((np.diff(line) > 0) & (far > near)[0], line, np.nan)
-    return depths, low, high, shown.ravel(), line
+    return depths, np.broadcast_to(f.in_view, (1, _DEPTHS, _PLACES))[0].any(axis=1)
 
 
 # --- camera and laser -------------------------------------------------------------------------------------------------
@@ -242,11 +182,11 @@ class _ModuleGeometry:
             end = last + np.where(length > 0, length, np.nan)[:, None] * directions
         return np.concatenate([points, end[:, None]], axis=1)
 
-    def project(self, axes: np.ndarray, about: np.ndarray | float) -> Module:
-        """Project the module onto ``axes`` (2, 3), with the drawing's origin at ``about``."""
+    def project(self, axes: np.ndarray) -> Module:
+        """Project the module onto ``axes`` (2, 3)."""
         forward = axes @ self.axis / np.linalg.norm(axes @ self.axis)
         sideways = np.array([forward[1], -forward[0]])
-        place = axes @ (self.origin - about)
+        place = axes @ self.origin
         front, half, corners = _BARE_FRONT_MM, _BARE_HALF_MM, np.empty((0, 2))
         if self.window is not None:
             normal = np.array(self.window.normal)
@@ -254,7 +194,7 @@ class _ModuleGeometry:
             half, front = self.described.aperture_diameter_mm / 2, self.described.distance_mm
             along = half * (np.array([seen[1], -seen[0]]) / np.linalg.norm(seen))
             inner = self.origin + front * self.axis
-            inner, outer = (axes @ (face - about) for face in (inner, inner + self.window.thickness_mm * normal))
+            inner, outer = (axes @ face for face in (inner, inner + self.window.thickness_mm * normal))
             corners = np.array([inner - along, inner + along, outer + along, outer - along])
         side, back = (half + _WALL_MM) * sideways, _HOUSING_MM * forward
         head = place + front * forward
@@ -280,7 +220,7 @@ _THIN = "#b9c2cc"
 _HOUSING = "#aab4c0"
 _VOLUME = "#f1ecd9"
 _VOLUME_END = "#bda96b"
-_INCHES = (11.5, 7.0)  # width and height
+_INCHES = (7.5, 7.0)  # width and height
 _MARGIN = 0.1
 """Margin around a view for dimensions, relative to its larger side."""
 _LABELS = 0.35
@@ -289,24 +229,19 @@ _ARC = 0.4
 """Radius of the arc at the triangulation angle, relative to the stand-off from the window."""
 
 
-def draw(side: SideView, front: FrontView, other: tuple[SideView, FrontView] | None = None) -> Figure:
-    """Draw a design's two views to scale; another design is drawn behind them as dashed lines, as far as it fits."""
-    boxes = [_box(view) for view in (side, front)]
-    widths = [float(np.ptp(box[:, 0])) for box in boxes]
-    figure, panels = new_figure(*_INCHES, columns=2, width_ratios=widths)
-    for axes, view, behind, box in zip(panels, (side, front), other or (None, None), boxes, strict=True):
-        for line in behind.outlines() if behind else ():
-            axes.plot(*line.T, "--", color=_BEHIND, linewidth=0.8)
-        axes.set(xlim=box[:, 0], ylim=box[::-1, 1], aspect="equal")
-        axes.grid(visible=False)
-        if isinstance(view, SideView):
-            _draw_side(axes, view)
-        else:
-            _draw_front(axes, view)
+def draw(view: SideView, other: SideView | None = None) -> Figure:
+    """Draw a design to scale; another design is drawn behind it as dashed lines, as far as it fits."""
+    figure, (axes,) = new_figure(*_INCHES)
+    box = _box(view)
+    for line in other.outlines() if other else ():
+        axes.plot(*line.T, "--", color=_BEHIND, linewidth=0.8)
+    axes.set(xlim=box[:, 0], ylim=box[::-1, 1], aspect="equal")
+    axes.grid(visible=False)
+    _draw_side(axes, view)
     return figure
 
 
-def _box(view: SideView | FrontView) -> np.ndarray:
+def _box(view: SideView) -> np.ndarray:
     """Return the smallest and largest coordinates (2, 2) of a view with its margins."""
     points = np.concatenate(view.outlines())
     points = points[np.isfinite(points).all(axis=1)]
@@ -376,22 +311,4 @@ def _draw_side(axes: Axes, view: SideView) -> None:
     _dimension(axes, (0.8 * left, outer), (0.8 * left, cross), f"stand-off {number_text(cross - outer)} mm")
     for depth in (outer, cross):
         axes.plot([0.8 * left, 0.0], [depth, depth], color=_THIN, linewidth=0.6)
-    axes.set(title="along the sheet", xlabel="across the stripe / mm", ylabel="depth from the pupil / mm")
-
-
-def _draw_front(axes: Axes, view: FrontView) -> None:
-    right, end = _labels_at(axes), max(edge[-1, 1] for edge in view.fan)
-    _fill(axes, np.concatenate([view.fan[0], view.fan[1][::-1]]), RED, 0.06)
-    _fill(axes, view.region, RED, 0.18)
-    _draw_module(axes, view.laser, "laser")
-    for edge in view.fan:
-        axes.plot(*edge.T, color=RED, linewidth=0.9)
-    for border in view.borders:
-        axes.plot(*np.where(border[:, 1:] <= end, border, np.nan).T, color=BLUE, linewidth=0.9)
-    axes.plot(*view.laser.origin, "o", color=INK, markersize=4.5)
-    for word, line in zip(("near", "middle", "far"), view.lines, strict=True):
-        if np.isfinite(line).all():
-            axes.plot(*line.T, color=RED, linewidth=2.8)
-            axes.plot([line[:, 0].max(), right], line[:, 1].max() * np.ones(2), color=_THIN, linewidth=0.6)
-            axes.text(right, line[0, 1], f" {word} {number_text(float(np.ptp(line[:, 0])))} mm", va="center")
-    axes.set(title="onto the sheet", xlabel="along the stripe / mm", ylabel="along the laser's axis / mm")
+    axes.set(xlabel="across the stripe / mm", ylabel="depth from the pupil / mm")

@@ -1,27 +1,276 @@
-"""Page of a study: the question and the design to build, as one HTML file without network resources."""
+"""Page of a study: the question, the design to build, and charts, as one HTML file without network resources."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import partial
+from html import escape
+from typing import Any
 
+import numpy as np
+import plotly.graph_objects as go
 from markupsafe import Markup
+from matplotlib.figure import Figure
+from plotly.subplots import make_subplots
 
-from twin.design.choice import StudyResults
+from twin.design.choice import StudyResults, find_pareto_front
 from twin.design.designs import Columns, HighlightedDesign
-from twin.design.report import charts, drawing, study_tables as tables
+from twin.design.figures_of_merit import RENDERED_SCATTERING_DEPTH
+from twin.design.report import drawing, study_tables as tables
 from twin.design.study import Study
 from twin.design.verification import Agreement
 from uwlts.errors import Error
-from uwlts.pages.toolkit import FigureCollector, figure_svg, render_page
+from uwlts.pages.toolkit import (
+    BLUE,
+    COLOURS,
+    INK,
+    RED,
+    FigureCollector,
+    figure_svg,
+    legend_below,
+    new_figure,
+    render_page,
+)
+
+Interactive = tuple[go.Figure, str]
+"""Figure for a page, and its caption."""
+
+_SYMBOLS = ("diamond", "circle", "star", "square", "cross")
+"""Symbols of highlighted designs."""
+_SHOWN = (
+    "sigma_z_rms_mm",
+    "sigma_z_mm",
+    "depth_per_px_mm",
+    "line_mm",
+    "standoff_mm",
+    "required_ms",
+    "occlusion_deg",
+    "coverage",
+    "section_cm2",
+    "sigma_y_mm",
+    "speckle_limit_mm",
+)
+"""Figures shown in addition to objectives and constraints, the most informative first."""
+_MOST_PANELS = 9  # of a figure, so that it fits on a page
+_PANEL_COLUMNS = 3  # of a page's width
+# Limits: more points make a page slow.
+MOST_POINTS = 20_000
+_MOST_IN_PANEL = 2_000
+_IN_SVG = 2500
+"""Above this number, points are drawn with WebGL, which is faster."""
+_WIDE_RANGE = 30.0
+"""Ratio of the largest to the smallest value above which a figure has a logarithmic axis or colours."""
+_escaped = partial(escape, quote=False)
+"""Escape text for plotly."""
+
+
+def shown_figures(judged: StudyResults) -> list[str]:
+    """Return the known figures to show: objectives, constraints, then the most informative others."""
+    names = dict.fromkeys([*judged.study.figures(), *_SHOWN])
+    return [name for name in names if np.isfinite(judged.figure(name)[judged.works]).any()]
+
+
+def figures_chart(judged: StudyResults, marked: Sequence[HighlightedDesign]) -> Interactive | None:
+    """Draw figures over the free ranges: over one, or by colour over two; over the rank if there are only choices.
+
+    Each point is a working design, hollow if it misses a constraint; None if no design works.
+    """
+    if not judged.works.any():
+        return None
+    study, names = judged.study, shown_figures(judged)[:_MOST_PANELS]
+    ranges = [name for name, variable in study.variables.items() if variable.values is None][:2]
+    front = judged.front(judged.of_interest)
+    places = np.flatnonzero(sample(judged.works, front, _MOST_IN_PANEL))
+    rows = -(-len(names) // _PANEL_COLUMNS)
+    titles = [_escaped(tables.label_of(name)) for name in names]
+    spacing: dict[str, Any] = {"horizontal_spacing": 0.12, "vertical_spacing": 0.3 / rows}
+    figure = make_subplots(rows, _PANEL_COLUMNS, subplot_titles=titles, **spacing)
+    for number, name in enumerate(names):
+        at: dict[str, Any] = {"row": number // _PANEL_COLUMNS + 1, "col": number % _PANEL_COLUMNS + 1}
+        _draw_panel(figure, judged, places, [*ranges, name], at)
+        for place, one in enumerate(marked) if ranges else ():
+            x, y = [*ranges, name][:2]
+            figure.add_trace(_mark(one, place, x, y, chosen=one is marked[-1]), **at)
+    figure.update_layout(template="plotly_white", height=120 + 280 * rows, showlegend=False)
+    count = int(judged.works.sum())
+    thin = f" {len(places):,} of {count:,} working designs are drawn." if len(places) < count else ""
+    dashed = " Dashed: bounds." if len(ranges) < 2 and study.bounds() else ""
+    return figure, f"Hollow: a constraint is missed.{dashed}{thin} Hover over a point for its design."
+
+
+def _draw_panel(
+    figure: go.Figure, judged: StudyResults, places: np.ndarray, names: Sequence[str], at: dict[str, Any]
+) -> None:
+    """Draw designs into a panel: the last one of the names is its figure, the others are free ranges."""
+    study, name = judged.study, names[-1]
+    found = judged.figure(name)[places]
+    marker = {"symbol": np.where(judged.feasible[places], "circle", "circle-open"), "color": BLUE}
+    shown = [judged.columns[each][places] for each in names[:2]]
+    if len(names) == 1:
+        rank = np.empty(len(judged))
+        rank[judged.best_first] = np.arange(1, len(judged.best_first) + 1)
+        shown = [rank[places], found]
+        figure.update_xaxes(title_text="rank", **at)
+    if len(names) == 3:
+        marker |= {"color": tables.round_for_json(found), "colorscale": "Viridis", "showscale": True}
+        marker["colorbar"] = _colour_bar(figure, **at)
+    figure.add_scatter(
+        x=tables.round_for_json(shown[0]),
+        y=tables.round_for_json(shown[-1]),
+        mode="markers",
+        marker=marker,
+        text=[_describe(judged, [name, *study.free()], int(place)) for place in places],
+        hovertemplate="%{text}<extra></extra>",
+        **at,
+    )
+    axes = ((figure.update_xaxes, names[0]), (figure.update_yaxes, names[1])) if len(names) > 1 else ()
+    for update, each in axes:
+        if each in study.variables:
+            update(title_text=_escaped(tables.label_of(each)), type=study.variables[each].scale, **at)
+    for each, _, bound in study.bounds() if len(names) < 3 else ():
+        if each == name:
+            figure.add_hline(bound, line={"color": RED, "dash": "dash"}, **at)
+
+
+def _colour_bar(figure: go.Figure, *, row: int, col: int) -> dict[str, object]:
+    """Return the layout of the colour bar beside a panel."""
+    panel = next(figure.select_xaxes(row=row, col=col)), next(figure.select_yaxes(row=row, col=col))
+    across, along = (axis.domain for axis in panel)
+    return {"x": across[1], "y": sum(along) / 2, "len": along[1] - along[0], "thickness": 8, "xpad": 2}
+
+
+def _mark(one: HighlightedDesign, number: int, x: str, y: str, *, chosen: bool) -> go.Scatter:
+    """Return a highlighted design as a symbol, the chosen one in red."""
+    colour = RED if chosen else INK
+    return go.Scatter(
+        x=tables.round_for_json([one.design.number_of(x)]),
+        y=tables.round_for_json([one.design.number_of(y)]),
+        mode="markers",
+        showlegend=False,
+        marker={"symbol": _SYMBOLS[number % len(_SYMBOLS)], "size": 12, "color": colour},
+        text=[f"<b>{_escaped(one.label)}</b>"],
+        textposition="top left" if number % 2 else "top right",
+        hovertemplate="%{text}<extra></extra>",
+    )
+
+
+def verification_chart(found: Agreement) -> tuple[Figure, str] | None:
+    """Draw predicted and rendered scatter, and the systematic error, over Z."""
+    if not found.z_mm:
+        return None
+    figure, (scatter, error) = new_figure(9.6, 3.2, columns=2)
+    z, predicted, rendered, off = map(np.array, (found.z_mm, found.predicted_mm, found.rendered_mm, found.error_mm))
+    scatter.plot(z, 1e3 * predicted, "o--", markersize=4, label="predicted by formulas")
+    scatter.plot(z, 1e3 * rendered, "o-", color=RED, markersize=4, label="rendered and measured")
+    error.plot(z, 1e3 * off, "o-", color=INK, markersize=4)
+    error.axhline(0, color=INK, linewidth=0.8)
+    scatter.set(xlabel="Z from the stand-off (mm)", ylabel="scatter along Z, σ (µm)")
+    scatter.set_ylim(bottom=0)
+    error.set(xlabel="Z from the stand-off (mm)", ylabel="systematic error (µm)")
+    legend_below(figure)
+    return figure, "Left: standard deviation of the points along Z. Right: their mean distance from the true plane."
+
+
+def choose_pareto_axes(judged: StudyResults) -> tuple[tuple[str, int], tuple[str, int]]:
+    """Return the two figures of the Pareto chart, each with 1 to minimise or -1 to maximise.
+
+    They are the study's first two objectives. With one objective, the second figure is the first constrained one, or
+    the line length without constraints.
+    """
+    wanted = [(o.figure, 1 if o.goal == "minimise" else -1) for o in judged.study.objectives]
+    wanted += [(name, 1 if c.least is None else -1) for name, c in judged.study.constraints.items()]
+    wanted += [("line_mm", -1), ("depth_mm", -1)]
+    second = wanted[-1]
+    for name, sign in reversed(wanted[1:]):
+        values = judged.figure(name)[judged.works & np.isfinite(judged.figure(name))]
+        varies = len(values) > 1 and float(np.ptp(values)) > 1e-9 * float(np.abs(values).max())
+        second = (name, sign) if varies and name != wanted[0][0] else second
+    return wanted[0], second
+
+
+def pareto_chart(judged: StudyResults, marked: Sequence[HighlightedDesign]) -> Interactive | None:
+    """Draw all working designs over two figures, and the Pareto front of those that meet the constraints."""
+    (x, x_sign), (y, y_sign) = choose_pareto_axes(judged)
+    values = np.column_stack([judged.figure(x) * x_sign, judged.figure(y) * y_sign])
+    known = judged.works & np.isfinite(values).all(axis=1)
+    if not known.any():
+        return None
+    front = find_pareto_front(np.where((judged.of_interest & known)[:, None], values, np.nan))
+    shown = sample(known, front, MOST_POINTS)
+    figure = go.Figure()
+
+    def add(name: str, places: np.ndarray, **style: object) -> None:
+        draw = go.Scattergl if len(places) > _IN_SVG else go.Scatter
+        across, along = (tables.round_for_json(judged.figure(each)[places]) for each in (x, y))
+        texts = [_describe(judged, [*judged.study.free(), x, y, "scattering_depth"], int(place)) for place in places]
+        about = {"text": texts, "hovertemplate": "%{text}<extra></extra>", "name": name}
+        figure.add_trace(draw(x=across, y=along, **about, **style))
+
+    for name, chosen, colour in (
+        ("misses a constraint", shown & ~judged.feasible & ~front, "#b3bcc6"),
+        ("meets all constraints", shown & judged.feasible & ~front, BLUE),
+    ):
+        if len(places := np.flatnonzero(chosen)):
+            add(name, places, mode="markers", marker={"color": colour, "opacity": 0.55})
+    order = np.flatnonzero(front)[np.argsort(values[front, 0])]
+    add(f"Pareto front ({len(order):,} of the designs)", order, mode="lines+markers", line={"color": COLOURS[2]})
+    for number, one in enumerate(marked):
+        if all(math.isfinite(one.design.number_of(name)) for name in (x, y)):
+            figure.add_trace(_mark(one, number, x, y, chosen=one is marked[-1]).update(mode="markers+text"))
+    for axis, name in ((figure.update_xaxes, x), (figure.update_yaxes, y)):
+        numbers = np.append(judged.figure(name)[known], [one.design.number_of(name) for one in marked])
+        wide = 0 < np.nanmin(numbers) * _WIDE_RANGE < np.nanmax(numbers)
+        axis(title_text=_escaped(tables.label_of(name)), type="log" if wide else "linear")
+    figure.update_layout(template="plotly_white", height=520, legend={"orientation": "h", "y": -0.16})
+    better = " and ".join(
+        f"{'less' if sign > 0 else 'more'} {tables.words_of(name)}" for name, sign in ((x, x_sign), (y, y_sign))
+    )
+    thin = f" {int(shown.sum()):,} of {int(known.sum()):,} designs are drawn." if shown.sum() < known.sum() else ""
+    none = (
+        "" if judged.feasible.any() else " No design meets all constraints: the front is that of all working designs."
+    )
+    turbid = int((judged.figure("scattering_depth")[known] > RENDERED_SCATTERING_DEPTH).sum())
+    deep = (
+        f" {turbid:,} of the designs are beyond the optical depth of scattering, {RENDERED_SCATTERING_DEPTH:g}, up to "
+        "which formulas and rendering were compared."
+        if turbid
+        else ""
+    )
+    more = " Further objectives are not shown." if len(judged.study.objectives) > 2 else ""
+    return (
+        figure,
+        f"Better is {better}. No design is better in both than a design on the line.{more}{none}{thin}{deep}",
+    )
+
+
+def _describe(judged: StudyResults, names: Sequence[str], place: int) -> str:
+    """Return the number and values of a design as lines of text."""
+    lines = [f"design {judged.columns['design'][place]}"]
+    for name in dict.fromkeys(names):
+        if name in judged.columns:
+            lines.append(_escaped(f"{tables.words_of(name)}: {tables.format_design_value(judged, name, place)}"))
+    return "<br>".join(lines)
+
+
+def sample(candidates: np.ndarray, kept: np.ndarray, most: int) -> np.ndarray:
+    """Select at most ``most`` of the candidates (N,): all ``kept`` ones, and others at random."""
+    others = np.flatnonzero(candidates & ~kept)
+    room = max(0, most - int(kept.sum()))
+    if len(others) > room:
+        others = np.random.default_rng(0).choice(others, room, replace=False)
+    chosen = kept.copy()
+    chosen[others] = True
+    return chosen
+
 
 _BEST = 20
 """Designs in the table of the best."""
 _DRAWN = (
-    "Lengths in mm; near, far and stand-off are measured from the window. Left: along the sheet, with the camera's "
-    "view in blue and the sheet in red (thick: in the camera's view and in the tinted measuring volume). Right: onto "
-    "the sheet, with the laser's fan, the image's border in blue, and the line's lengths. Windows and rays are to "
-    "scale; the housings are only indicated."
+    "Along the sheet, lengths in mm; near, far and stand-off are measured from the window. The camera's view is blue, "
+    "the sheet red (thick: in the camera's view and in the tinted measuring volume). Windows and rays are to scale; "
+    "the housings are only indicated."
 )
 
 
@@ -42,8 +291,8 @@ def page_text(
     """
     judged, collected = StudyResults(study, columns), FigureCollector()
     nothing = "" if judged.works.any() else "None of the designs works: see the reasons below."
-    over_free = charts.figures_chart(judged, marked)
-    pareto, parallel = charts.pareto_chart(judged, marked), charts.parallel_chart(judged)
+    over_free = figures_chart(judged, marked)
+    pareto = pareto_chart(judged, marked)
     return render_page(
         "twin.design.report",
         "template.html.j2",
@@ -56,14 +305,13 @@ def page_text(
         drawing=_drawing(study, marked),
         over_free=over_free and collected.add(*over_free),
         pareto=pareto and collected.add(*pareto),
-        parallel=parallel and collected.add(*parallel),
         nothing=nothing if len(judged) else "No design has been evaluated.",
         number=tables.number_text,
         value=tables.value_text,
         verdicts=[
             (found, tables.agreement_text(study, found), drawn and (figure_svg(drawn[0]), drawn[1]))
             for found in agreements
-            for drawn in [charts.verification_chart(found)]
+            for drawn in [verification_chart(found)]
         ],
         best=_best(judged),
         failures=tables.failure_counts(judged),
@@ -78,15 +326,15 @@ def _drawing(study: Study, marked: Sequence[HighlightedDesign]) -> tuple[Markup 
         return None, "There is no design to draw."
     chosen, base = marked[-1], marked[0]
     try:
-        views = drawing.make_views(chosen.sensor, study.medium_of(chosen.sensor))
+        view = drawing.make_view(chosen.sensor, study.medium_of(chosen.sensor))
     except Error as error:
         return None, f"The design cannot be drawn: {error}."
     other = None
     if base is not chosen:
         with suppress(Error):
-            other = drawing.make_views(base.sensor, study.medium_of(base.sensor))
+            other = drawing.make_view(base.sensor, study.medium_of(base.sensor))
     behind = f" Dashed grey behind, as far as it fits in: {base.label}." if other else ""
-    return figure_svg(drawing.draw(*views, other)), _DRAWN + behind
+    return figure_svg(drawing.draw(view, other)), _DRAWN + behind
 
 
 def _best(judged: StudyResults) -> tuple[list[str], list[list[str]]]:

@@ -14,7 +14,7 @@ from twin.design.designs import HighlightedDesign
 from twin.design.figures_of_merit import CLASS_NAMES, FIGURES, RENDERED_SCATTERING_DEPTH
 from twin.design.study import Study, Variable
 from twin.design.verification import Agreement
-from twin.scene.paths import Value
+from twin.scene.description import Value
 from uwlts.model.media import FUSED_SILICA_MPA, GLASSES
 from uwlts.model.sensor import Window
 from uwlts.pages.toolkit import Tile

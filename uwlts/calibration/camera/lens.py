@@ -14,8 +14,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from uwlts.calibration.camera.camera_parameters import DISTORTION, CameraOptions, Intrinsics
-from uwlts.calibration.camera.target_images import TargetImage
+from uwlts.calibration.camera.camera_parameters import DISTORTION, CameraOptions, Intrinsics, TargetImage
 from uwlts.calibration.camera.target_poses import CameraSolution, Poses, solve_camera
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.fitting.least_squares import DEFAULT_K, MAD_TO_STD

@@ -9,6 +9,7 @@ import numpy as np
 import yaml
 
 from uwlts.argument_types import check_arguments
+from uwlts.calibration.camera.camera_parameters import TargetImage
 from uwlts.calibration.camera.lens import (
     WIDE_DEG,
     Distortion,
@@ -18,7 +19,6 @@ from uwlts.calibration.camera.lens import (
     calibrate_lens,
     require_coefficients,
 )
-from uwlts.calibration.camera.target_images import TargetImage
 from uwlts.errors import CalibrationError, DescriptionError, ImageError, TargetError
 from uwlts.files.reading import is_regular_file
 from uwlts.files.writing import write_atomically

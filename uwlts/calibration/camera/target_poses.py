@@ -10,13 +10,20 @@ import cv2
 import numpy as np
 from pydantic import JsonValue
 
-from uwlts.calibration.camera.camera_parameters import CameraOptions, Intrinsics
-from uwlts.calibration.camera.target_images import Placement, TargetImage, observe, placements, pose_values
+from uwlts.calibration.camera.camera_parameters import (
+    CameraOptions,
+    Intrinsics,
+    Placement,
+    TargetImage,
+    observe,
+    placements,
+    pose_values,
+)
 from uwlts.errors import CalibrationError
 from uwlts.fitting.schur_least_squares import Observation, SchurFit, schur_least_squares
 from uwlts.model.calibration import CameraModel
 from uwlts.optics.camera import project
-from uwlts.targets.detection.ellipse_bias import circle_centre_bias
+from uwlts.targets.detection.ellipses import circle_centre_bias
 
 # Coordinates are normalised: a direction with an extent of the points below this fraction of the largest one, or
 # a null vector separated from others by less than this, cannot be distinguished from rounding and lens distortion.

@@ -9,8 +9,14 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from uwlts.calibration.camera.camera_parameters import CameraOptions, Intrinsics
-from uwlts.calibration.camera.target_images import Placement, TargetImage, observe, pose_values
+from uwlts.calibration.camera.camera_parameters import (
+    CameraOptions,
+    Intrinsics,
+    Placement,
+    TargetImage,
+    observe,
+    pose_values,
+)
 from uwlts.calibration.camera.target_poses import CameraSolution, Poses, solve_camera
 from uwlts.calibration.sequential.sheet_fit import fit_sheet, points_on_target
 from uwlts.errors import CalibrationError, RangeError

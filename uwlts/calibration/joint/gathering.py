@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pydantic import JsonValue
 
-from uwlts.calibration.camera.camera_parameters import CameraOptions
-from uwlts.calibration.camera.target_images import Placement, placements
+from uwlts.calibration.camera.camera_parameters import CameraOptions, Placement, placements
 from uwlts.calibration.capture_evidence import (
     AirEvidence,
     StepEvidence,

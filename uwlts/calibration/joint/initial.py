@@ -9,8 +9,7 @@ from typing import assert_never
 import cv2
 import numpy as np
 
-from uwlts.calibration.camera.camera_parameters import DISTORTION, CameraOptions, Intrinsics
-from uwlts.calibration.camera.target_images import Placement
+from uwlts.calibration.camera.camera_parameters import DISTORTION, CameraOptions, Intrinsics, Placement
 from uwlts.calibration.camera.target_poses import (
     CameraSolution,
     placement_pose,
@@ -34,8 +33,7 @@ from uwlts.calibration.sequential.sequential_calibration import CalibrationOptio
 from uwlts.calibration.sequential.sheet_fit import fit_sheet, object_frame
 from uwlts.calibration.sequential.step_images import label_steps
 from uwlts.errors import CalibrationError, EvaluationError
-from uwlts.evaluation.artefact_figures import evaluate_pipe, evaluate_plane
-from uwlts.evaluation.spheres import evaluate_spheres
+from uwlts.evaluation.artefact_figures import evaluate_pipe, evaluate_plane, evaluate_spheres
 from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard
 from uwlts.model.calibration import Calibration, CameraModel, SheetModel, WindowModel
 from uwlts.model.parameter_keys import StepHeight

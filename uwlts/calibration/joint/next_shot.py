@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.camera.target_images import Placement, pose_values
+from uwlts.calibration.camera.camera_parameters import Placement, pose_values
 from uwlts.calibration.joint.estimate import Evidence, Noise, add_common_error
 from uwlts.calibration.joint.observability import (
     compute_mesh_lengths,
@@ -24,7 +24,7 @@ from uwlts.fitting.next_observation import Candidate, CovarianceRoot, Forecast, 
 from uwlts.model.calibration import Calibration, rigid_transform
 from uwlts.model.parameter_keys import ParameterKey, StageParameter, StepHeight
 from uwlts.model.sensor import Uncertainty
-from uwlts.optics.sheet import sheet_surface
+from uwlts.optics.triangulation import sheet_surface
 from uwlts.stripe.capture_stripes import FEWEST_LINES
 from uwlts.targets import Target, parse_target
 

@@ -12,7 +12,7 @@ from uwlts.model.parameter_keys import LensParameter, MediumIndex, ParameterKey,
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Sensor, Uncertainty
 from uwlts.optics.camera import directions, image_derivatives, project_through_window
-from uwlts.optics.sheet import behind_window_mm, fan_distances, sheet_surface
+from uwlts.optics.triangulation import behind_window_mm, fan_distances, sheet_surface
 from uwlts.optics.window import RayDerivatives, tilt_direction, trace_derivatives
 
 LENS = tuple(key for key in LensParameter if key is not LensParameter.F)

@@ -33,8 +33,8 @@ from uwlts.calibration.joint.parameters import Parameters
 from uwlts.calibration.joint.problem import JointProblem, joint_problem
 from uwlts.calibration.joint.residuals import BENDS, STRETCH, STRIPE
 from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
-from uwlts.calibration.moved_sheet import doubt_sheet_at_rest
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
+from uwlts.calibration.target_stripes import doubt_sheet_at_rest
 from uwlts.errors import CalibrationError
 from uwlts.model.parameter_keys import LensParameter, ParameterKey, TargetParameter
 

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 from scipy import sparse
 
-from uwlts.calibration.camera.target_images import Placement
+from uwlts.calibration.camera.camera_parameters import Placement
 from uwlts.calibration.camera.target_poses import centre_offsets
 from uwlts.calibration.joint.parameters import Parameters, SheetPoints, ViewMedium
-from uwlts.fitting.point_spacing import group_rows
+from uwlts.fitting.local_surface import group_rows
 from uwlts.fitting.schur_least_squares import LocalPrior
 from uwlts.model.calibration import rigid_transform
 from uwlts.model.parameter_keys import ParameterKey, StageParameter, StepHeight, TargetParameter

@@ -10,7 +10,7 @@ from scipy import sparse
 
 from uwlts.calibration.joint.parameters import Parameters
 from uwlts.calibration.joint.residuals import Distances, Residuals, StripeEvidence
-from uwlts.fitting.point_spacing import group_rows
+from uwlts.fitting.local_surface import group_rows
 from uwlts.fitting.schur_least_squares import LocalPrior
 from uwlts.model.parameter_keys import StageParameter
 from uwlts.model.sensor import Uncertainty

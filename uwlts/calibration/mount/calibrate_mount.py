@@ -8,11 +8,19 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount.artefact_shapes import SHAPES
 from uwlts.calibration.mount.captured_profiles import CapturedProfiles, mount_covariance, reconstruct_profiles
 from uwlts.calibration.mount.hand_eye import mount_by_board
 from uwlts.calibration.mount.next_pose import NextPose, next_pose, require_determined, weaknesses
-from uwlts.calibration.mount.profile_evidence import Motion, MountState, Problem, Scatter, from_sheet, thin, to_sheet
+from uwlts.calibration.mount.profile_evidence import (
+    SHAPES,
+    Motion,
+    MountState,
+    Problem,
+    Scatter,
+    from_sheet,
+    thin,
+    to_sheet,
+)
 from uwlts.calibration.mount.restricted_likelihood import (
     LARGEST_ROUGH,
     NotSettled,

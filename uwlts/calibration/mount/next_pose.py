@@ -7,8 +7,7 @@ from itertools import product
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount.artefact_shapes import SphereShape
-from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, point_by_mount, to_sheet
+from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, SphereShape, point_by_mount, to_sheet
 from uwlts.calibration.mount.restricted_likelihood import RestrictedEstimate
 from uwlts.errors import CalibrationError
 from uwlts.fitting.next_observation import Candidate, CovarianceRoot, rank_candidates

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy.spatial import ConvexHull
 
-from uwlts.calibration.camera.target_images import TargetImage
+from uwlts.calibration.camera.camera_parameters import TargetImage
 from uwlts.calibration.capture_evidence import AirEvidence
 from uwlts.errors import CalibrationError
 from uwlts.model.placement import laser_pose
@@ -17,7 +17,7 @@ from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.triangulation import reconstruct_pixels
 from uwlts.optics.window import RayStatus
 from uwlts.storage.capture import Capture, CaptureHeader
-from uwlts.targets.detection.ellipse_bias import circle_centre_bias
+from uwlts.targets.detection.ellipses import circle_centre_bias
 
 # The deviation of a plane's image from a homography, by lens and window, is smooth: the fifth degree describes it to a
 # micrometre in a view 200 mm wide. With fewer than three points for each coefficient, noise would be fitted.

@@ -12,9 +12,8 @@ import numpy as np
 from pydantic import JsonValue
 
 from uwlts._version import __version__
-from uwlts.calibration.camera.camera_parameters import CameraOptions
+from uwlts.calibration.camera.camera_parameters import CameraOptions, TargetImage
 from uwlts.calibration.camera.lens import LensCalibration, LensChoice, calibrate_lens, half_doubt
-from uwlts.calibration.camera.target_images import TargetImage
 from uwlts.calibration.camera.target_poses import CameraSolution, Poses, refuse_turned_travel, solve_camera
 from uwlts.calibration.capture_evidence import (
     AirEvidence,
@@ -23,8 +22,6 @@ from uwlts.calibration.capture_evidence import (
     find_air_evidence,
     step_evidence,
 )
-from uwlts.calibration.moved_sheet import doubt_sheet_at_rest
-from uwlts.calibration.sequential.plausibility import doubt_step_height, doubt_target_size
 from uwlts.calibration.sequential.sheet_fit import (
     SheetSolution,
     StripePoints,
@@ -32,8 +29,14 @@ from uwlts.calibration.sequential.sheet_fit import (
     object_frame,
     points_on_target,
 )
-from uwlts.calibration.sequential.step_images import label_steps
-from uwlts.calibration.sequential.window_distance import WindowSolution, solve_window
+from uwlts.calibration.sequential.step_images import (
+    WindowSolution,
+    doubt_step_height,
+    doubt_target_size,
+    label_steps,
+    solve_window,
+)
+from uwlts.calibration.target_stripes import doubt_sheet_at_rest
 from uwlts.errors import CalibrationError
 from uwlts.fitting.propagation import jackknife
 from uwlts.model.calibration import Calibration, WindowModel

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import AfterValidator
 
 from uwlts.errors import ImageError
-from uwlts.model.clipped import mark_clipped
+from uwlts.stripe.exposures import mark_clipped
 
 # OpenCV's order of colours.
 _COLOURS = {"blue": 0, "green": 1, "red": 2}

@@ -1,8 +1,13 @@
 """Detection of circles, lattices of circles, and corners in images."""
 
-from uwlts.targets.detection.chessboard_grid import count_corners, find_chessboard_fault, refine_corners
+from uwlts.targets.detection.chessboard_grid import (
+    convert_to_eight_bit,
+    count_corners,
+    find_chessboard_fault,
+    measure_corners,
+    refine_corners,
+)
 from uwlts.targets.detection.chessboard_lattice import find_board
-from uwlts.targets.detection.corners import convert_to_eight_bit, measure_corners
 from uwlts.targets.detection.ellipses import Ellipses, find_circles, measure_marks
 from uwlts.targets.detection.lattice import Lattice, detect_lattice, label_lattice
 

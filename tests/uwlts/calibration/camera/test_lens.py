@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
+from uwlts.calibration.camera.camera_parameters import TargetImage
 from uwlts.calibration.camera.lens import LensChoice, calibrate_lens, half_doubt
-from uwlts.calibration.camera.target_images import TargetImage
 from uwlts.errors import CalibrationError
 from uwlts.model.sensor import Distortion
 

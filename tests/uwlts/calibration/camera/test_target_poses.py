@@ -8,8 +8,14 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from tests.uwlts.calibration_views import Lens, built_sensor, inside, lattice, lens_of, stage_images, turn
-from uwlts.calibration.camera.camera_parameters import CameraOptions, Intrinsics
-from uwlts.calibration.camera.target_images import TargetImage, observe, placements, z_away
+from uwlts.calibration.camera.camera_parameters import (
+    CameraOptions,
+    Intrinsics,
+    TargetImage,
+    observe,
+    placements,
+    z_away,
+)
 from uwlts.calibration.camera.target_poses import direct_linear, solve_camera, stage_direction
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.fitting.schur_least_squares import Observation, schur_least_squares

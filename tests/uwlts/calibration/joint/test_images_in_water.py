@@ -8,11 +8,11 @@ import pytest
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import Noise, gathered, target_series
 from tests.virtual_sensors import altered
+from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.camera.camera_parameters import CameraOptions
 from uwlts.calibration.camera.lens import LensChoice
 from uwlts.calibration.joint.policy import solve_and_check
 from uwlts.calibration.joint.problem import joint_problem
-from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.model.parameter_keys import LensParameter, ParameterKey, WindowParameter
 

@@ -9,9 +9,9 @@ from tests.uwlts.calibration_views import WATER, built_sensor
 from tests.uwlts.joint_views import Noise, assert_derivatives, gathered, lit_points, step_views, target_series
 from tests.uwlts.simulated_campaign import ModelErrors, drawn_reality, evidence
 from tests.virtual_sensors import altered
+from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.joint.initial import estimate_series_start
 from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior, ViewMedium
-from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.residuals import TARGET, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError
@@ -19,7 +19,7 @@ from uwlts.model.calibration import FanModel, SheetModel
 from uwlts.model.parameter_keys import StageParameter, StepHeight, TargetParameter, WindowParameter, parse_parameter
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.optics.nominal import nominal_calibration
-from uwlts.optics.sheet import sheet_surface
+from uwlts.optics.triangulation import sheet_surface
 
 BOW = 0.001
 BUILT = built_sensor()

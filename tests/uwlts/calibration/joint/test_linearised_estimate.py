@@ -7,8 +7,8 @@ import pytest
 
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import Noise, gathered, target_series
+from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.joint.problem import joint_problem
-from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.residuals import TARGET
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.model.parameter_keys import LensParameter, TargetParameter

@@ -8,7 +8,8 @@ import pytest
 from tests.uwlts.calibration_views import built_sensor, inside, lattice
 from tests.uwlts.joint_views import TARGET, Noise, gathered, lit_points, seen, step_views, target_series
 from tests.virtual_sensors import altered, with_fine_target
-from uwlts.calibration.camera.target_images import TargetImage
+from uwlts.calibration.calibrate import solve_jointly
+from uwlts.calibration.camera.camera_parameters import TargetImage
 from uwlts.calibration.capture_evidence import AirEvidence
 from uwlts.calibration.joint.gathering import Series
 from uwlts.calibration.joint.next_shot import advice_lines, rank_next_shots
@@ -20,7 +21,6 @@ from uwlts.calibration.joint.observability import (
     list_regions,
     read_region_estimate,
 )
-from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.model.parameter_keys import SheetParameter, StepHeight, WindowParameter, parse_parameter
 from uwlts.targets import parse_target

@@ -13,11 +13,11 @@ from tests.uwlts import drawn_stripes
 from tests.uwlts.calibration_views import STEP_MM, built_sensor
 from tests.uwlts.joint_views import Noise, gathered, lit_points, seen, target_series
 from tests.virtual_sensors import with_fine_target
+from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.capture_evidence import StepEvidence
 from uwlts.calibration.joint.estimate import estimate
 from uwlts.calibration.joint.observability import compute_mesh_lengths, list_regions, read_region_estimate
 from uwlts.calibration.joint.parameters import EarlierEstimate, Prior, ViewMedium
-from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.refresh import refresh, solve_refreshed
 from uwlts.calibration.joint.residuals import StepProfileEvidence
 from uwlts.calibration.joint.stored_estimate import read_original_estimate, read_stored_estimate

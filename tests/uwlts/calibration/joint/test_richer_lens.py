@@ -8,8 +8,8 @@ import pytest
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import Noise, gathered, target_series
 from tests.virtual_sensors import altered
+from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.camera.lens import LensChoice
-from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError
 from uwlts.model.parameter_keys import LensParameter

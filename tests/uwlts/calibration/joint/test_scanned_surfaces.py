@@ -11,13 +11,13 @@ from tests.uwlts.calibration_views import WATER
 from tests.uwlts.joint_views import Noise, assert_derivatives, gathered, target_series
 from tests.uwlts.scan_views import NONE, SLOPE, VIEW, Body, scan_of, square_sensor, stage_direction
 from tests.virtual_sensors import with_fine_target
+from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.camera.camera_parameters import CameraOptions, Intrinsics
 from uwlts.calibration.joint import policy
 from uwlts.calibration.joint.estimate import estimate
 from uwlts.calibration.joint.gathering import scan_stripes
 from uwlts.calibration.joint.initial import build_all_scan_evidence, build_scan_evidence
 from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior
-from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.residuals import STEP, Residuals
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, ScannedPipe, ScannedPlane, ScannedSpheres
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions

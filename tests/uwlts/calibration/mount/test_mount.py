@@ -23,7 +23,7 @@ from uwlts.calibration.mount import restricted_likelihood
 from uwlts.cli import main
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.mount import Mount, PlaneFound, SphereFound
-from uwlts.shapes.circle import Circle
+from uwlts.shapes.flat import Circle
 from uwlts.storage.mount_files import read_mount, read_profiles
 from uwlts.storage.pose_files import read_poses
 

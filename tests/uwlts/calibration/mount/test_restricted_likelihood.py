@@ -8,8 +8,7 @@ from scipy.optimize import brentq
 from scipy.stats import f, norm, t
 
 from tests.uwlts.mount_views import MOUNT, RADIUS_MM, SPHERE_MM, sphere_campaign
-from uwlts.calibration.mount.artefact_shapes import SHAPES
-from uwlts.calibration.mount.profile_evidence import MountState, Problem
+from uwlts.calibration.mount.profile_evidence import SHAPES, MountState, Problem
 from uwlts.calibration.mount.restricted_likelihood import NotSettled, settle, settle_agreeing
 
 

@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 
 from tests.oracles.fermat import directions_seen, plate
 from tests.uwlts.calibration_views import WATER, built_sensor, inside, lattice, lens_of, turn
-from uwlts.calibration.camera.target_images import TargetImage
+from uwlts.calibration.camera.camera_parameters import TargetImage
 from uwlts.calibration.capture_evidence import AirEvidence
 from uwlts.calibration.polynomial.polynomial_calibration_fit import (
     MOST_SMOOTH,

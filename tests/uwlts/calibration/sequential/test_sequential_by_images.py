@@ -9,8 +9,8 @@ import pytest
 from tests.uwlts.calibration_views import built_sensor, lattice, lens_of, stage_images, stripes_on_target, turn
 from tests.uwlts.joint_views import TARGET
 from tests.virtual_sensors import altered
+from uwlts.calibration.camera.camera_parameters import TargetImage
 from uwlts.calibration.camera.lens import LensChoice
-from uwlts.calibration.camera.target_images import TargetImage
 from uwlts.calibration.capture_evidence import AirEvidence
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, CalibrationResult, Evidence, solve
 from uwlts.model.placement import laser_pose

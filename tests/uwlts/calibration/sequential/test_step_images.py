@@ -10,8 +10,7 @@ from tests.uwlts.joint_views import gathered
 from uwlts.calibration.capture_evidence import StepEvidence
 from uwlts.calibration.joint.initial import build_step_evidence
 from uwlts.calibration.joint.parameters import Prior, ViewMedium
-from uwlts.calibration.sequential.step_images import StandardTurn, label_steps
-from uwlts.calibration.sequential.window_distance import solve_window
+from uwlts.calibration.sequential.step_images import StandardTurn, label_steps, solve_window
 from uwlts.model.artefacts import StepStandard
 from uwlts.model.calibration import WindowModel
 from uwlts.model.parameter_keys import StepHeight

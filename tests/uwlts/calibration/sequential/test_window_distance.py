@@ -8,8 +8,7 @@ import pytest
 
 from tests.uwlts.calibration_views import STEP_MM, WATER, built_sensor, nine_steps, step_profile, through_window
 from uwlts.calibration.capture_evidence import StepEvidence
-from uwlts.calibration.sequential.step_images import label_step
-from uwlts.calibration.sequential.window_distance import solve_window, step_profile as reconstructed
+from uwlts.calibration.sequential.step_images import label_step, solve_window, step_profile as reconstructed
 from uwlts.errors import CalibrationError, EvaluationError, RangeError
 from uwlts.model.artefacts import StepStandard
 from uwlts.model.calibration import WindowModel

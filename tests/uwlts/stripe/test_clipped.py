@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwlts.model.clipped import has_marks, mark_clipped, split_clipped
+from uwlts.stripe.exposures import has_marks, mark_clipped, split_clipped
 
 
 @pytest.mark.parametrize("bits", [9, 11, 15])
