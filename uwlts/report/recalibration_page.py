@@ -9,8 +9,8 @@ import numpy as np
 from uwlts.files.json_files import json_text
 from uwlts.pages.toolkit import Tile, render_page, write_page
 from uwlts.recalibration.recalibrate import ParameterChange, Recalibrated, SurfaceParts
-from uwlts.report.plot import surface_limit_mm
 from uwlts.report.change_page import draw_views
+from uwlts.report.plot import surface_limit_mm
 
 RECALIBRATION = "recalibration"
 """Kind of the page, in the name of its JSON file."""
