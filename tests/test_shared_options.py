@@ -17,6 +17,7 @@ APPS = {"uwlts": uwlts.cli.app, "twin": twin.cli.app}
 
 MEANING = {
     "uwlts": {
+        "--artefact": "artefact's kind and calibrated values|of known size",
         "--calibration": "[Cc]alibration",
         "--camera": "[Aa]ddress of (the|a) camera",
         "--captures": "[Cc]aptures",

@@ -14,7 +14,7 @@ from uwlts.errors import CalibrationError, EvaluationError
 from uwlts.fitting.least_squares import biweight
 from uwlts.fitting.patches import find_disc_radius
 from uwlts.fitting.propagation import noise_shifts
-from uwlts.recalibration.pass_estimate import POOR_FIT, chance, estimate_covariance
+from uwlts.recalibration.pass_estimate import POOR_FIT, chance, estimate_covariance, normal_equations
 from uwlts.recalibration.surface_cells import CELL, PassPoints, divide, observe
 from uwlts.storage.cloud import PointCloud
 
@@ -103,20 +103,16 @@ def check_passes(cloud: PointCloud) -> PassCheck | None:
     except (CalibrationError, EvaluationError):
         return None  # no overlap, or too few points
     unknowns = len(known.patterns_mm)
-    amplitudes, squares, weights = np.zeros(unknowns), np.ones(len(cells)), np.ones(len(cells))
-    total = np.eye(unknowns)
-    for _ in range(2):
-        total, gradient = np.eye(unknowns), np.zeros(unknowns)
-        spread = max(1.0, float(np.sqrt(np.mean(squares[weights > 0]))))
-        for cell, weight in zip(cells, weights, strict=True):
-            rows = cell.apart.T @ cell.rows / spread
-            total += weight * rows.T @ rows
-            gradient += weight * rows.T @ (cell.apart.T @ cell.residuals) / spread
-        amplitudes = -np.linalg.solve(total, gradient)
-        left = [cell.apart.T @ (cell.residuals + cell.rows @ amplitudes) for cell in cells]
-        squares = np.array([np.mean(each**2) if len(each) else 0.0 for each in left])
-        weights = biweight(np.sqrt(squares / max(float(np.median(squares)), 1e-12)))
-    covariance = estimate_covariance(cells, weights / spread**2, total, points, None)
+    none = np.zeros(unknowns)
+    total, gradient = normal_equations(cells, np.ones(len(cells)), none)
+    amplitudes = -np.linalg.solve(total, gradient)
+    left = [cell.apart.T @ (cell.residuals + cell.rows @ amplitudes) for cell in cells]
+    squares = np.array([np.mean(each**2) for each in left])
+    weights = biweight(np.sqrt(squares / max(float(np.median(squares)), 1e-12)))
+    spread = max(1.0, float(np.sqrt(np.mean(squares[weights > 0]))))
+    total, gradient = normal_equations(cells, weights, none)
+    amplitudes = -np.linalg.solve(total, gradient)
+    covariance = estimate_covariance(cells, weights, total, points, None)
     probability = chance(amplitudes, covariance, np.eye(unknowns))
     return PassCheck(
         len(np.unique(number)), len(cells), probability, spread, _find_cause(cloud, amplitudes, covariance)

@@ -245,12 +245,7 @@ def solve_passes(problem: PassProblem, *, size_mm: float, artefact: Artefact | N
             spread = max(1.0, float(np.sqrt(np.mean(squares[weights > 0]))))
         elif done < _FREE_ROUNDS:
             weights = np.ones(len(cells))
-        total = np.eye(problem.unknowns)
-        gradient = amplitudes.copy()
-        for cell, weight in zip(cells, weights, strict=True):
-            rows = cell.apart.T @ cell.rows
-            total += weight * rows.T @ rows
-            gradient += weight * rows.T @ (cell.apart.T @ cell.residuals)
+        total, gradient = normal_equations(cells, weights, amplitudes)
         if lengths is not None:
             total += lengths.rows.T @ lengths.rows
             gradient += lengths.rows.T @ lengths.residuals(amplitudes)
@@ -266,6 +261,18 @@ def solve_passes(problem: PassProblem, *, size_mm: float, artefact: Artefact | N
         )
     covariance = estimate_covariance(cells, weights, total, points, lengths)
     return PassSolution(amplitudes, covariance, first_cells, cells, spread, used, lengths)
+
+
+def normal_equations(
+    cells: Sequence[Cell], weights: np.ndarray, amplitudes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the matrix (U, U) and the gradient (U,) of prior knowledge and of weighted cells."""
+    total, gradient = np.eye(len(amplitudes)), amplitudes.copy()
+    for cell, weight in zip(cells, weights, strict=True):
+        rows = cell.apart.T @ cell.rows
+        total += weight * rows.T @ rows
+        gradient += weight * rows.T @ (cell.apart.T @ cell.residuals)
+    return total, gradient
 
 
 def _correct(cells: Sequence[Cell], points: PassPoints, step: np.ndarray) -> np.ndarray:
