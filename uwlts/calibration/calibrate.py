@@ -11,7 +11,7 @@ from uwlts.calibration.camera.camera_parameters import CameraOptions
 from uwlts.calibration.camera.lens import Distortion, LensChoice, Pixels, require_coefficients
 from uwlts.calibration.camera.target_poses import Poses
 from uwlts.calibration.joint.estimate import Estimate
-from uwlts.calibration.joint.gathering import Gathered, gather_jointly
+from uwlts.calibration.joint.gathering import Gathered, gather_jointly, hold_camera
 from uwlts.calibration.joint.policy import solve_consistently
 from uwlts.calibration.joint.scanned_surfaces import ScannedPlane, SurfaceScanEvidence
 from uwlts.calibration.joint.stored_estimate import build_calibration
@@ -58,7 +58,7 @@ def calibrate_jointly(
 
 def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointResult:
     """Calibrate from gathered evidence; errors as `calibrate_jointly`."""
-    off_px: dict[str, list[float]] = {}
+    options, off_px = hold_camera(gathered, options), dict[str, list[float]]()
     try:
         problem, result, against, changes = solve_consistently(gathered, options)
         if against.all_against():
@@ -116,8 +116,8 @@ def calibrate(
     """Calibrate camera, window and sheet from images of a target in air or in water, and of a step standard in water.
 
     From a target in air and steps the calibration is sequential: camera and sheet first, then the window's distance.
-    With a target in water, with scans, or with ``joint``, all parameters are estimated together, with their covariance
-    (docs: joint calibration).
+    With a target in water, with scans, with ``uncertainty.focal_length`` in the description, or with ``joint``, all are
+    estimated together, with their covariance (docs: joint calibration).
 
     Parameters
     ----------
@@ -209,7 +209,9 @@ def calibrate(
                     f"{capture.path.name} says that it was taken in air: give it with `air`, or correct the medium in "
                     "its description"
                 )
-        if joint or water or scan:
-            targets = [*in_air, *in_water]
+        targets = [*in_air, *in_water]
+        # The sequential calibration does not use prior knowledge of the lens.
+        known = any(capture.header.sensor.uncertainty.focal_length is not None for capture in targets)
+        if joint or water or scan or known:
             return calibrate_jointly(targets, steps, scans, options=options, progress=progress).calibration
         return calibrate_sequentially(in_air, steps, options=options, progress=progress).calibration

@@ -168,7 +168,9 @@ def _check_places(inherited: _Inherited, sensor: Sensor) -> Iterator[str]:
     if blur > _BLUR_PX:
         places = ", ".join(f"{distance:.1f} in {name}" for name, distance in seen.items())
         misfit = f"; the stand-off, {standoff:.1f} mm from the pupil, is blurred by {blur:.1f} px"
-        advice = f"set it to the apparent distance in mm of the stand-off ({places})"
+        advice = (
+            f"set it to the apparent distance in mm of the stand-off ({places}), and f_number ({camera.f_number:g})"
+        )
         yield from inherited.say("camera.focus_distance_mm", [*_PLACEMENT, *_LENS, *window, *media], misfit, advice)
     away = float(np.linalg.norm(laser_pose(sensor).origin_mm - (0.0, 0.0, standoff)))
     index = max(indices.values(), default=1.0)

@@ -583,7 +583,7 @@ class Uncertainty(Description):
     - ``sheet_offset_mm``, ``sheet_turn_deg``: position and directions of the sheet as built, where no image determines
       them (`uwlts recalibrate` from a description).
     - ``focal_length``: relative error of the focal length, of a camera that was calibrated before. Default: unknown,
-      since lens names are rounded and focusing changes it.
+      since lens names are rounded and focusing changes it. With 0, principal point and distortion are held, too.
     """
 
     window_distance_mm: NotNegative = 5.0
@@ -606,7 +606,7 @@ class Uncertainty(Description):
     sheet_thickness: NotNegative = 0.1
     sheet_offset_mm: Positive = 2.0
     sheet_turn_deg: Positive = 0.5
-    focal_length: Positive | None = None
+    focal_length: NotNegative | None = None
 
     def scaled(self, factor: float) -> "Uncertainty":
         """Return all uncertainties multiplied by a factor."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -21,11 +21,11 @@ from uwlts.fitting.propagation import jackknife
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration
 from uwlts.model.media import water_absorption_per_m
-from uwlts.model.phase_functions import PetzoldAverage, PhaseFunction
+from uwlts.model.phase_functions import FournierForand, HenyeyGreenstein, PetzoldAverage, PhaseFunction
 from uwlts.model.sensor import CaptureHeader
 from uwlts.optics.fitness import check_fits
 from uwlts.radiometry.followed_sensor import follow_sensor
-from uwlts.radiometry.result import SIGNIFICANT, ImageEstimate, PartFit, Radiometry, compare_estimates, read_estimates
+from uwlts.radiometry.result import ImageEstimate, PartFit, Radiometry
 from uwlts.radiometry.scattering import STEP_PX, HaloKernel
 from uwlts.radiometry.stripe_images import (
     BLOCKS,
@@ -54,12 +54,18 @@ _KNOWN_ATTENUATION = 0.3
 """Standard uncertainty of the attenuation in 1/m from which the described water is kept: over 0.7 m of path, the laser
 power then changes by a fifth."""
 _ROUNDS = 3  # between tail and brightness, which depend little on each other
+_OTHER_PHASES = (
+    HenyeyGreenstein(0.85), HenyeyGreenstein(0.95), FournierForand(1.0563, 3.3), FournierForand(1.1488, 3.9)
+)  # fmt: skip
+"""Phase functions at the ends of what particles in natural water have: mean cosines of 0.85 to 0.95, and slopes with
+indices coupled by Mobley, Sundman and Boss (2002). The images rarely show which one it is."""
 _SCATTERING_STD = 0.04
 """Relative standard uncertainty of the scattering coefficient by the model of the halo, for a known phase function.
 
 Both relative uncertainties were chosen on the captures 0 to 11 of docs/studies/radiometry.py, and judged on others."""
-_WIDTH_STD = 0.01
-"""Relative standard uncertainty of the sheet's radius by the neglected light that is scattered by less than a pixel."""
+_WIDTH_STD, _WIDTH_BY_HALO = 0.01, 0.05
+"""Relative standard uncertainty of the sheet's radius by the neglected light that is scattered by less than a pixel: a
+part, and one for each scattering length of path, chosen on seeds 0 to 9 of docs/studies/radiometry_faults.py."""
 _LEAST_SIGMA_PX = 0.5
 """Least standard deviation of the sheet in the image for which its radius is separable from pixel and blur."""
 _CELL_PX = 6  # of the tail, whose mean residuals are judged; the halo falls by a third there at most
@@ -71,6 +77,7 @@ _HALO_MISFIT = 0.05
 _MOST_COLOUR_PER_M, _COLOUR_PER_NM = 39.0, 0.014
 """Absorption at 380 nm beyond that of water, and its decrease. The brownest of 20 Finnish and Estonian lakes has 19.5/m
 (Sipelgas et al. 2003, Hydrology Research 34:361); twice as much leaves room for particles. At 635 nm it is 1.1/m."""
+_SIGNIFICANT = 3.0  # standard uncertainties beyond the absorption of natural water: one of 740 by chance
 _AS_DESCRIBED = np.zeros(2)
 _FAN_STD = 0.1
 """Standard uncertainty of the described power along the fan, relative, at its edges: line lasers are specified so."""
@@ -82,7 +89,6 @@ def fit_radiometry(
     *,
     reflectance: float = 0.8,
     repeats: Capture | str | Path | None = None,
-    compared_with: str | Path | None = None,
     stripe: StripeSettings = None,
     progress: ProgressListener = ignore_progress,
 ) -> Radiometry:
@@ -105,8 +111,6 @@ def fit_radiometry(
     repeats : Capture or path, optional
         Laser images that were repeated at one position and exposure, for the camera's gain; by default those in the
         scan, if there are any.
-    compared_with : path, optional
-        Earlier result (JSON). The changes are listed with their significance.
     stripe : StripeOptions or dict, optional
         As for `reconstruct`.
     progress : callable, optional
@@ -136,7 +140,6 @@ def fit_radiometry(
     known = resolve_calibration(calibration)
     if not isinstance(known, Calibration):
         raise CalibrationError("a calibration by polynomials has no paths of the light: give one by models")
-    earlier = None if compared_with is None else read_estimates(compared_with)
     with open_capture(capture) as scan:
         check_fits(scan.header, known, source=scan.path.name)
         if np.isfinite(scan.pose).any() or scan.header.provenance.get("stage") == NO_STAGE:
@@ -149,8 +152,13 @@ def fit_radiometry(
         stripes = fill_gaps(find_stripes(scan, options=stripe, progress=progress))
         light = stripe_light(scan.header, known, stripes, scan.stage_mm)
         images = measure_stripes(scan, stripes, light.usable, progress)
-        evidence = _Evidence.gather(scan.header, known, light, images)
+        evidence, *others = (
+            _Evidence.gather(scan.header, known, light, images, phase)
+            for phase in (_described_phase(scan.header), *_OTHER_PHASES)
+        )
         whole, covariance = evidence.estimate_with_covariance()
+        separated = math.sqrt(covariance[1, 1]) < _KNOWN_ATTENUATION
+        covariance += evidence.spread(whole, others)
         with nullcontext() if repeats is None else open_capture(repeats) as again:
             noise = measure_noise(scan if again is None else again)
         parts = (
@@ -159,12 +167,13 @@ def fit_radiometry(
         )
         doubtful = {name for part in parts if part.misfit > 1 for name in part.names}
         log_warnings(scan.path.name, [f"the fit of its {part.line()}" for part in parts if part.misfit > 1])
-        determined = math.sqrt(covariance[1, 1]) < _KNOWN_ATTENUATION and "attenuation_per_m" not in doubtful
+        determined = separated and "attenuation_per_m" not in doubtful
         described = 1e3 * scan.header.medium.extinction_per_mm(scan.header.sensor.laser.wavelength_nm)
         if not determined:
             doubtful.add("attenuation_per_m")
             free, free_variance = whole[1], covariance[1, 1]
-            whole, covariance = evidence.estimate_with_covariance(attenuation_per_m=described)
+            whole, covariance = evidence.estimate_with_covariance(described)
+            covariance += evidence.spread(whole, others, described)
             whole[1], covariance[1, 1] = free, free_variance
         found = list(zip(_NAMES, whole.tolist(), np.sqrt(np.diag(covariance)).tolist(), strict=True))
         if noise is not None:
@@ -199,11 +208,9 @@ def fit_radiometry(
             parts=parts,
             not_separable=_not_separable(correlation, by_name, determined, described, float(np.ptp(evidence.paths))),
             outlook=outlook(scan.header, known, by_name, images, determined=determined),
-            changes=() if earlier is None else compare_estimates(estimates, earlier),
             sources={
                 "capture": describe_source(scan).model_dump(mode="json"),
                 "calibration": calibration_digest(known),
-                "compared_with": None if compared_with is None else Path(compared_with).name,
             },
             path_mm=(float(evidence.paths.min()), float(evidence.paths.max())),
         )
@@ -245,7 +252,12 @@ class _Evidence:
 
     @classmethod
     def gather(
-        cls, header: CaptureHeader, calibration: Calibration, light: StripeLight, images: StripeImages
+        cls,
+        header: CaptureHeader,
+        calibration: Calibration,
+        light: StripeLight,
+        images: StripeImages,
+        phase: PhaseFunction,
     ) -> _Evidence:
         """Average the geometry over groups, and tabulate the halo of every block over the scattering coefficient."""
         held = images.of_group >= 0
@@ -266,13 +278,13 @@ class _Evidence:
         blur = defocus_variance(header.sensor, calibration, mean(light.depth_mm), medium_index=index)
         sheet_of_block = mean_of_block(sheet)
         nodes = np.concatenate([[0.0], np.geomspace(1e-2, _MOST_SCATTERING_PER_M, _SCATTERING_NODES - 1)])
-        per_sr, core = _phase(header), images.width // 2
+        core = images.width // 2
         sigma = np.full(BLOCKS, 1.0)
         tails, within = [], []
         for j, (own, seen, first, second) in enumerate(
             zip(sheet_of_block, *map(mean_of_block, (ray, to_laser, to_camera)), strict=True)
         ):
-            kernel = HaloKernel(per_sr, ((first, own), (second, seen)))
+            kernel = HaloKernel(phase.per_sr, ((first, own), (second, seen)))
             middle = int(np.argmin(np.abs(kernel.place_px)))
             step = round(1 / STEP_PX)
             rows = [kernel.profile(1e-3 * b, sigma_px=sigma[j]) for b in nodes]
@@ -298,6 +310,14 @@ class _Evidence:
             within=CubicSpline(nodes, np.array(within), axis=1),
         )
 
+    def spread(
+        self, whole: np.ndarray, others: Sequence[_Evidence], attenuation_per_m: float | None = None
+    ) -> np.ndarray:
+        """Return the mean square of the changes of the estimates ``whole`` with other phase functions."""
+        every = np.ones(BLOCKS, bool)
+        changes = np.array([other.estimate(every, attenuation_per_m) for other in others]) - whole
+        return changes.T @ changes / len(changes)
+
     def estimate_with_covariance(self, attenuation_per_m: float | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return the estimates in the order of `_NAMES`, and their covariance; with a given attenuation, if any.
 
@@ -317,7 +337,8 @@ class _Evidence:
         moved[scattering] = math.copysign(_SCATTERING_STD * whole[scattering], moved[scattering])
         covariance += np.outer(moved, moved)
         radius = _NAMES.index("sheet_radius_mm")
-        covariance[radius, radius] += (_WIDTH_STD * whole[radius]) ** 2
+        wider = math.hypot(_WIDTH_STD, _WIDTH_BY_HALO * 1e-3 * self.path_mm * whole[scattering])
+        covariance[radius, radius] += (wider * whole[radius]) ** 2
         return whole, covariance
 
     def estimate(
@@ -433,7 +454,7 @@ class _Evidence:
             ),
             PartFit(
                 "absorption of the water",
-                max(least - absorption, absorption - most, 0.0) / (SIGNIFICANT * math.sqrt(less @ covariance @ less)),
+                max(least - absorption, absorption - most, 0.0) / (_SIGNIFICANT * math.sqrt(less @ covariance @ less)),
                 f"attenuation less scattering is {absorption:.2g}/m, in natural water {least:.2g} to {most:.2g}/m; "
                 "translucent surface, or another reflectance with the path?",
                 ("power_reflectance_mw", "attenuation_per_m", "scattering_per_m", "background_dn"),
@@ -441,14 +462,11 @@ class _Evidence:
         )
 
 
-def _phase(header: CaptureHeader) -> Callable[[np.ndarray], np.ndarray]:
+def _described_phase(header: CaptureHeader) -> PhaseFunction:
     """Return the phase function of the medium's particles; Petzold's average particle if none are described."""
     scatterers = header.medium.scatterers(header.sensor.laser.wavelength_nm)
-    particles: PhaseFunction = PetzoldAverage()
-    for part in scatterers:
-        if part.phase.name != "molecular":
-            particles = part.phase
-    return particles.per_sr
+    particles = [each.phase for each in scatterers if each.phase.name != "molecular"]
+    return particles[-1] if particles else PetzoldAverage()
 
 
 def _natural_absorption(header: CaptureHeader) -> tuple[float, float]:
@@ -500,5 +518,6 @@ def _not_separable(
     if by_name["stripe_sigma_px"].value < _LEAST_SIGMA_PX:
         found.append("radius of the sheet and pixel: the stripe is narrower than a pixel, and the radius is its limit")
     found.append("waist and focus of the sheet: only its radius at the surface; the described focus is kept")
+    found.append("sheet and a surface that light enters by up to 0.2 mm: it seems up to a quarter thicker")
     found.append("background by dark current, black level and daylight: only their sum at this exposure")
     return tuple(found)

@@ -1,9 +1,8 @@
-"""Result of `uwlts.fit_radiometry`: estimates, their files, and the comparison of two results."""
+"""Result of `uwlts.fit_radiometry`: estimates and their files."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -11,15 +10,12 @@ from typing import Any
 import numpy as np
 
 from uwlts.argument_types import check_arguments
-from uwlts.errors import CaptureError
-from uwlts.files.json_files import json_text, read_json
+from uwlts.files.json_files import json_text
 from uwlts.files.writing import require_ending, write_atomically
 from uwlts.model.sensor import Sensor, Table
 from uwlts.model.short_text import Brief
 
 FORMAT, VERSION = "uwlts-radiometry", 1
-SIGNIFICANT = 3.0
-"""Changes above this multiple of their standard uncertainty are called significant: one of 370 by chance."""
 
 
 @dataclass(frozen=True)
@@ -54,25 +50,6 @@ class PartFit:
     def line(self) -> str:
         """Return the fit as text."""
         return f"{self.part}: {self.misfit:.2f}" + (f", not explained: {self.finding}" if self.misfit > 1 else "")
-
-
-@dataclass(frozen=True)
-class EstimateChange:
-    """Change of an estimate since an earlier result; ``significance`` is in combined standard uncertainties."""
-
-    name: str
-    meaning: str
-    unit: str
-    before: float
-    after: float
-    std: float
-    significance: float
-
-    def line(self) -> str:
-        """Return the change as text."""
-        text = f"{self.meaning}: {self.before:.4g} -> {self.after:.4g} {self.unit}".rstrip()
-        marked = " (significant)" if abs(self.significance) > SIGNIFICANT else ""
-        return f"{text}, {self.after - self.before:+.3g} ± {self.std:.2g}, {self.significance:+.1f} sigma{marked}"
 
 
 @dataclass(frozen=True)
@@ -129,8 +106,6 @@ class Radiometry(Brief):
     not_separable : tuple of str
         Quantities that the images do not separate.
     outlook : Outlook
-    changes : tuple of EstimateChange
-        Changes since an earlier result, if one was given.
     sources : dict
         Digests of capture and calibration.
     path_mm : (float, float)
@@ -146,7 +121,6 @@ class Radiometry(Brief):
     parts: tuple[PartFit, ...]
     not_separable: tuple[str, ...]
     outlook: Outlook
-    changes: tuple[EstimateChange, ...]
     sources: Table
     path_mm: tuple[float, float]
 
@@ -165,8 +139,6 @@ class Radiometry(Brief):
             *(f"  {each.line()}" for each in self.parts),
             "not separable in these images:",
             *(f"  {text}" for text in self.not_separable),
-            *([f"changes since {self.sources.get('compared_with')}:"] if self.changes else []),
-            *(f"  {each.line()}" for each in self.changes),
         ]
 
     def record(self) -> Table:
@@ -183,7 +155,6 @@ class Radiometry(Brief):
             "parts": [asdict(each) for each in self.parts],
             "not_separable": list(self.not_separable),
             "outlook": asdict(self.outlook),
-            "changes": [asdict(each) for each in self.changes],
             "path_mm": list(self.path_mm),
         }
         return content
@@ -213,41 +184,6 @@ class Radiometry(Brief):
         ):
             record.write_text(json_text(self.record(), indent=1), encoding="utf-8")
             description.write_text(text, encoding="utf-8")
-
-
-def read_estimates(path: str | Path) -> tuple[ImageEstimate, ...]:
-    """Read the estimates of an earlier result; CaptureError if the file is missing, foreign or damaged."""
-    found = _read(path, "estimates")
-    try:
-        return tuple(ImageEstimate(**each) for each in found)
-    except TypeError as error:
-        raise CaptureError(f"{path} is damaged: its estimates are no table") from error
-
-
-def _read(path: str | Path, key: str) -> Any:
-    if Path(path).suffix == ".toml":
-        raise CaptureError(f"{path} is the description; give the result beside it, {Path(path).stem}.json")
-    content = read_json(path, called="result of uwlts radiometry")
-    if content.get("format") != FORMAT or content.get("version") != VERSION:
-        raise CaptureError(f"{path} is JSON but not a result of uwlts radiometry, version {VERSION}")
-    if key not in content:
-        raise CaptureError(f"{path} is damaged: it has no {key}")
-    return content[key]
-
-
-def compare_estimates(now: Sequence[ImageEstimate], before: Sequence[ImageEstimate]) -> tuple[EstimateChange, ...]:
-    """Return the changes of all estimates that both results determine, in combined standard uncertainties."""
-    earlier: Mapping[str, ImageEstimate] = {each.name: each for each in before if each.determined}
-    changes = []
-    for each in now:
-        old = earlier.get(each.name)
-        if old is None or not each.determined:
-            continue
-        std = math.hypot(each.std, old.std)
-        moved = each.value - old.value
-        significance = moved / std if std > 0 else math.copysign(math.inf, moved) if moved else 0.0
-        changes.append(EstimateChange(each.name, each.meaning, each.unit, old.value, each.value, std, significance))
-    return tuple(changes)
 
 
 def format_value(value: float, std: float) -> str:

@@ -3,6 +3,7 @@
 import numpy as np
 
 from uwlts.calibration.camera.camera_parameters import DISTORTION
+from uwlts.calibration.joint.gathering import HELD
 from uwlts.calibration.joint.parameters import SHEET, DescribedSheet, Prior, fan_priors, window_priors
 from uwlts.errors import CalibrationError
 from uwlts.model.calibration import Calibration, KnownMedium
@@ -27,7 +28,8 @@ def as_built(sensor: Sensor, medium: Medium) -> Calibration:
     plain = nominal_calibration(sensor)
     assert plain.window is not None
     known, camera, sheet = sensor.uncertainty, plain.camera, DescribedSheet.from_sensor(sensor)
-    turn, focal = float(np.radians(known.sheet_turn_deg)), known.focal_length or _FOCAL
+    turn = float(np.radians(known.sheet_turn_deg))
+    focal = _FOCAL if known.focal_length is None else max(known.focal_length, HELD)
     index = medium.refractive_index(sensor.laser.wavelength_nm)
     priors: dict[ParameterKey, Prior] = {LensParameter.F: Prior(camera.fx_px, focal * camera.fx_px)}
     described = camera.parameters()

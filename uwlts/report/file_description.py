@@ -96,6 +96,7 @@ def read(
     ...     images = [frame.image for frame in capture if frame.laser_on]
     """
     path = Path(path)
+    pose_format = "tum" if path.suffix.lower() == ".tum" else pose_format
     if pose_format.partition(":")[0] in ("ros", "tum"):
         return read_trajectory(path, pose_format=pose_format, unit=pose_unit)
     require_regular_file(path)

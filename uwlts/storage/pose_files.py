@@ -210,7 +210,7 @@ def _poses(table: NumberTable, pose_format: PoseFormat, unit: Unit | None) -> tu
         stated = units.get(name, "")
         if name in ROTATION_NAMES and stated and stated != pose_format.rpartition("-")[2]:
             raise DescriptionError(
-                f"{path} has {name} in {stated}, but the format {pose_format} was given: choose a format that ends "
+                f"{path} has {name} in {stated}, but the format is {pose_format}: choose a format that ends "
                 "with the angles' unit, -deg or -rad"
             )
     rows = np.column_stack([columns[name] for name in names]) if columns else np.empty((0, 0))
@@ -254,7 +254,7 @@ def _order_names(names: list[str], pose_format: PoseFormat, path: Path) -> list[
     form, _, order = pose_format.partition("-")
     if named and form not in allowed:
         raise DescriptionError(
-            f"{path} has the columns {', '.join(names)}, but the format {pose_format} was given: choose the format "
+            f"{path} has the columns {', '.join(names)}, but the format is {pose_format}: choose the format "
             "that the names describe"
         )
     found: list[str] = [axis for axis in "xyz" if axis in names]

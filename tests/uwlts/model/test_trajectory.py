@@ -86,7 +86,7 @@ def test_other_files_are_refused(tmp_path, text, pose_format, message):
 def test_repeated_poses_are_dropped_and_counted(tmp_path):
     rows = [f"{1.7e9 + time:.2f} {time} 0 0 0 0 0 1" for time in (0.0, 0.25, 0.25, 0.25, 0.5)]
     (tmp_path / "a.tum").write_text("\n".join(rows))
-    found = uwlts.read(tmp_path / "a.tum", pose_format="tum")
+    found = uwlts.read(tmp_path / "a.tum")
     assert (found.times_s - 1.7e9).tolist() == [0, 0.25, 0.5] and found.poses[:, 0, 3].tolist() == [0, 250, 500]
     assert "2 of 5 poses repeat" in found.warnings[0]
     found.save(tmp_path / "b.csv")

@@ -11,8 +11,8 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 import uwlts
-from uwlts.model.phase_functions import HenyeyGreenstein, PetzoldAverage
-from uwlts.radiometry.fit import _NAMES, _Evidence, _natural_absorption
+from uwlts.model.phase_functions import FournierForand, HenyeyGreenstein, PetzoldAverage, PhaseFunction
+from uwlts.radiometry.fit import _NAMES, _OTHER_PHASES, _Evidence, _natural_absorption
 from uwlts.radiometry.followed_sensor import follow_sensor
 from uwlts.radiometry.scattering import STEP_PX, HaloKernel
 from uwlts.radiometry.stripe_images import BLOCKS, GROUP_LINES, TAIL_PX, StripeImages
@@ -25,10 +25,13 @@ NATURAL = (0.301, 1.399)
 PATHS = ((320.0, 0.4), (420.0, 0.5))
 
 
+PETZOLD = PetzoldAverage()
+
+
 @cache
-def halos(phase: type) -> tuple[np.ndarray, np.ndarray]:
-    """Return tails (nodes, TAIL_PX) and light within the width (nodes,) of Petzold's or Henyey-Greenstein's halos."""
-    kernel = HaloKernel((PetzoldAverage() if phase is PetzoldAverage else HenyeyGreenstein(0.9)).per_sr, PATHS)
+def halos(phase: PhaseFunction) -> tuple[np.ndarray, np.ndarray]:
+    """Return tails (nodes, TAIL_PX) and light within the width (nodes,) of the halos of a phase function."""
+    kernel = HaloKernel(phase.per_sr, PATHS)
     middle, step = int(np.argmin(np.abs(kernel.place_px))), round(1 / STEP_PX)
     rows = np.array([kernel.profile(1e-3 * b, sigma_px=1.0) for b in NODES])
     reach = round(0.5 * WIDTH / STEP_PX)
@@ -36,7 +39,7 @@ def halos(phase: type) -> tuple[np.ndarray, np.ndarray]:
     return rows[:, middle + step :: step][:, :TAIL_PX], within
 
 
-def draw(rng: np.random.Generator, phase: type = PetzoldAverage) -> _Evidence:
+def draw(rng: np.random.Generator, phase: PhaseFunction = PETZOLD, known: PhaseFunction = PETZOLD) -> _Evidence:
     """Draw what the images of an inclined wall show: 20 images with 20 groups of lines each, and grains."""
     block = np.arange(GROUPS) * BLOCKS // GROUPS
     fan, paths = np.tile(np.linspace(-0.8, 0.8, 20), 20), np.repeat(np.linspace(620.0, 880.0, 20), 20)
@@ -60,11 +63,11 @@ def draw(rng: np.random.Generator, phase: type = PetzoldAverage) -> _Evidence:
         grain=np.tile(GRAIN**2 * np.eye(1, 9), (BLOCKS, 1)),
         peak_dn=2000.0,
     )
-    known = [np.repeat(each[None], BLOCKS, axis=0) for each in halos(PetzoldAverage)]
+    fitted = [np.repeat(each[None], BLOCKS, axis=0) for each in halos(known)]
     return _Evidence(
         images=images, sheet_per_px=np.ones(BLOCKS), blur_var=np.zeros(BLOCKS), model=model, fan=fan, paths=paths,
         distance_mm=400.0, path_mm=750.0, dark_e=0.0, nodes=NODES,
-        tails=CubicSpline(NODES, known[0], axis=1), within=CubicSpline(NODES, known[1], axis=1),
+        tails=CubicSpline(NODES, fitted[0], axis=1), within=CubicSpline(NODES, fitted[1], axis=1),
     )  # fmt: skip
 
 
@@ -122,10 +125,29 @@ def test_a_reflectance_with_the_path_shows_if_no_natural_water_absorbs_so_much()
 
 def test_another_phase_function_is_not_noticed_from_the_halo():
     """Henyey-Greenstein's g = 0.9 has nearly the halo of more of Petzold's particles: it is listed as not separable."""
-    evidence = draw(np.random.default_rng(5), HenyeyGreenstein)
+    evidence = draw(np.random.default_rng(5), HenyeyGreenstein(0.9))
     found = evidence.estimate(np.ones(BLOCKS, bool))[_NAMES.index("scattering_per_m")]
     assert found > 1.08 * B
     assert max(misfits(evidence)) < 1
+
+
+def test_the_uncertainty_contains_another_phase_function():
+    """Scattering, attenuation and background of drawn phase functions, fitted as Petzold's average particle."""
+    rng = np.random.default_rng(7)
+    drawn: list[PhaseFunction] = [HenyeyGreenstein(g) for g in rng.uniform(0.85, 0.95, 3)]
+    drawn += [FournierForand(1.01 + 0.1542 * (slope - 3), slope) for slope in rng.uniform(3.3, 3.9, 3)]
+    truth = {"scattering_per_m": B, "attenuation_per_m": C, "background_dn": BACKGROUND}
+    places = [_NAMES.index(name) for name in truth]
+    alone, stated = [], []
+    for number, phase in enumerate(drawn):
+        evidence = draw(np.random.default_rng(number), phase)
+        others = [draw(np.random.default_rng(number), phase, other) for other in _OTHER_PHASES]
+        whole, covariance = evidence.estimate_with_covariance()
+        for found, more in ((alone, 0.0), (stated, evidence.spread(whole, others))):
+            found.append((whole[places] - [*truth.values()]) / np.sqrt(np.diag(covariance + more))[places])
+    # Six drawn ones: at most two and a half standard uncertainties, and more than that without the others.
+    assert np.abs(stated).max() < 2.5 < np.abs(alone).max() / 2
+    assert 0.3 < np.sqrt(np.mean(np.square(stated))) < 1.3
 
 
 def test_description_keeps_what_is_not_determined():

@@ -67,7 +67,7 @@ def format_deviation(key: ParameterKey, value: float, known: float, std: float, 
                     f", and whether it faces the laser: a rotation by {turn:.1f}° about the stripe explains the height"
                 )
         case LensParameter() | WindowParameter() | SheetParameter() | StageParameter() | TargetParameter():
-            check = _CHECK[key]
+            check = _CHECK.get(key, "the known camera")
         case _:
             assert_never(key)
     quantity = key.quantity

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pydantic import JsonValue
 
-from uwlts.calibration.camera.camera_parameters import CameraOptions, Placement, placements
+from uwlts.calibration.camera.camera_parameters import DISTORTION, CameraOptions, Placement, placements
+from uwlts.calibration.camera.lens import LensChoice
 from uwlts.calibration.capture_evidence import (
     AirEvidence,
     StepEvidence,
@@ -20,7 +21,7 @@ from uwlts.calibration.joint.scanned_surfaces import SLOPES
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, common_sensor, sources_of
 from uwlts.errors import CalibrationError, DescriptionError, EvaluationError
 from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard, parse_artefact
-from uwlts.model.calibration import WindowModel
+from uwlts.model.calibration import CameraModel, WindowModel
 from uwlts.model.parameter_keys import LensParameter, MediumIndex, ParameterKey, StageParameter, StepHeight
 from uwlts.model.sensor import Medium, Sensor, Uncertainty
 from uwlts.optics.brightness import fit_brightness_slopes, select_sharp_lines
@@ -33,6 +34,9 @@ _MOST_LEFT_OUT = 0.3  # fraction of the images: if more contradict the rest, it 
 USUAL_DISTORTION: dict[ParameterKey, Prior] = {LensParameter.K1: Prior(0.0, 1 / 3), LensParameter.K2: Prior(0.0, 1.0)}
 """Size of the coefficients that every lens has: k1 is -1/3 for r = f angle, and smaller for most lenses. Images that do
 not determine one then state what it does to the others: without it, a window or focal length takes its place."""
+HELD = 1e-4
+"""Standard uncertainty of the slopes of a held camera's rays: its focal length relative, 0.1 px of a centre at 1000 px.
+A lens changes as much by two kelvins, and images that contradict it by ten times as much are noticed."""
 Scanned = SphereStandard | PlaneStandard | PipeStandard
 
 
@@ -248,7 +252,14 @@ def build_priors(
     for (name, medium), index in zip(gathered.media.items(), gathered.indices(options), strict=True):
         std = medium.index_uncertainty(sensor.laser.wavelength_nm, known)
         priors[MediumIndex(name)] = Prior(index, known.index if options.medium_index else std)
-    if known.focal_length is not None and (window is not None or not gathered.media):
+    if known.focal_length == 0:
+        described = CameraModel.from_description(sensor.camera)
+        of_px = dict.fromkeys(DISTORTION, HELD)
+        priors |= {
+            key: Prior(described.parameters()[key.text], of_px.get(key.text, HELD * described.fx_px))
+            for key in LensParameter
+        }
+    elif known.focal_length is not None and (window is not None or not gathered.media):
         focal, aspect = sensor.camera.focal_lengths_px(), options.camera.pixel_aspect
         keys = (LensParameter.FX, LensParameter.FY) if aspect is None else (LensParameter.F,)
         priors |= {key: Prior(px, known.focal_length * px) for key, px in zip(keys, focal, strict=False)}
@@ -266,6 +277,22 @@ def build_priors(
         if options.lens is not None and options.lens.distortion == "auto":
             priors |= usual_distortion(options.camera)
     return priors | heights
+
+
+def hold_camera(gathered: Gathered, options: CalibrationOptions) -> CalibrationOptions:
+    """Return options for a camera that is held if the description states it as exact, else the given ones.
+
+    Raises DescriptionError if the options state what to estimate of it; CalibrationError without a window in a medium,
+    which changes the lens.
+    """
+    if gathered.sensor.uncertainty.focal_length != 0:
+        return options
+    if options.lens not in (None, LensChoice()):
+        raise DescriptionError("uncertainty.focal_length = 0 holds the camera: leave out `distortion` and `pixels`")
+    if gathered.media and not gathered.sensor.camera.window.mounted:
+        raise CalibrationError("a lens in contact with a medium is another one: a camera is held only behind a window")
+    names = tuple(name for name, value in gathered.sensor.camera.distortion if value or name in ("p1", "p2"))
+    return replace(options, lens=None, camera=CameraOptions(names))
 
 
 def usual_distortion(camera: CameraOptions) -> dict[ParameterKey, Prior]:

@@ -145,23 +145,26 @@ def estimate_series_start(
     tangential = tuple(key.text for key in list_added_tangential(camera, sensor.uncertainty))
     extended = replace(camera, distortion=(*camera.distortion, *tangential))
     intrinsics = Intrinsics(extended, width_px=width_px, height_px=height_px)
-    base = min(series, key=lambda s: (s.view.medium is not None, s.view.window, -len(s.found.images)))
-    solve = _camera_solver(base, sensor, options)
-    try:
-        seen = solve(base.found.images, options=camera)
-    except CalibrationError:  # coefficients that are not determined start at zero
-        seen = solve(base.found.images, options=replace(camera, distortion=()))
-    rms = seen.image_rms_px()
-    if base.view == ViewMedium(False, None) and not np.median(rms) <= _largest_misfit_px(seen.model.fx_px):
-        raise CalibrationError(
-            f"no camera fits the target images in air: the median residual is {np.median(rms):.1f} px (rms), and "
-            f"{rms.max():.1f} px in {base.found.names()[np.argmax(rms)]}: check the target's spacing, the stage's "
-            "positions, and that all captures are from the same camera and medium"
-        )
-    lens = intrinsics.from_model(seen.model)
-    index = _index_behind_window(base.view, indices)
-    for place, name in enumerate(intrinsics.names):
-        lens[place] /= index if name in ("f", "fx", "fy") else index**2 if name in DISTORTION else 1.0
+    if sensor.uncertainty.focal_length == 0:
+        lens = intrinsics.from_model(CameraModel.from_description(sensor.camera))
+    else:
+        base = min(series, key=lambda s: (s.view.medium is not None, s.view.window, -len(s.found.images)))
+        solve = _camera_solver(base, sensor, options)
+        try:
+            seen = solve(base.found.images, options=camera)
+        except CalibrationError:  # coefficients that are not determined start at zero
+            seen = solve(base.found.images, options=replace(camera, distortion=()))
+        rms = seen.image_rms_px()
+        if base.view == ViewMedium(False, None) and not np.median(rms) <= _largest_misfit_px(seen.model.fx_px):
+            raise CalibrationError(
+                f"no camera fits the target images in air: the median residual is {np.median(rms):.1f} px (rms), and "
+                f"{rms.max():.1f} px in {base.found.names()[np.argmax(rms)]}: check the target's spacing, the stage's "
+                "positions, and that all captures are from the same camera and medium"
+            )
+        lens = intrinsics.from_model(seen.model)
+        index = _index_behind_window(base.view, indices)
+        for place, name in enumerate(intrinsics.names):
+            lens[place] /= index if name in ("f", "fx", "fy") else index**2 if name in DISTORTION else 1.0
     start = SeriesStart(sensor, window, indices, intrinsics, lens, [], [])
     for part in series:
         seen_by = _Viewpoint(intrinsics.model(lens), window, indices, part.view)
