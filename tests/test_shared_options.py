@@ -38,6 +38,7 @@ MEANING = {
         "--title": "Title of the",
         "--overwrite": "Replace|replace",
         "--pixels": "Whether pixels are square",
+        "--page": "Page to write, with all figures",
         "--pdf": "Also print the page",
         "--plan": "[Pp]lan of (a scan|an acceptance test)|TOML file with sensor, medium, positions",
         "--port": "[Pp]ort of the page",
