@@ -252,7 +252,7 @@ def measure(captures: list[Path], found: uwlts.Calibration) -> dict[str, float]:
 def run(seed: int, folder: Path, kind: str) -> dict[str, Any]:
     """Return ``rows`` of axis, error and stated uncertainty before and after, mm, the ``doubts``, and what was found.
 
-    A ``robot`` moves the shifted passes, but states poses that err by 0.05 mm and 0.02 deg.
+    A ``robot`` moves the shifted passes, but states poses with errors of 0.05 mm and 0.02 deg.
     """
     captures, poses = record(seed, folder, turned=kind == "turned")
     mm, deg = (ROBOT_MM, ROBOT_DEG) if kind == "robot" else (POSE_MM, POSE_DEG)

@@ -1,8 +1,8 @@
 """Check of a cloud by its own overlaps: surfaces that the sensor passed twice agree within the stated uncertainty.
 
 The unknowns are the independent errors in the cloud's uncertainty (calibration, water, mount, path), of zero mean and
-unit variance. One linear step estimates them from the disagreement of the passes (`surface_cells`). What they become,
-relative to chance, is the verdict.
+unit variance. One linear step estimates them from the disagreement of the passes (`surface_cells`). The verdict is the
+probability of values as large by chance.
 """
 
 from dataclasses import dataclass
@@ -48,15 +48,15 @@ class PassCheck:
 
     @property
     def text(self) -> str:
-        """The result in words."""
+        """The result as text."""
         seen = f"{self.passes} passes overlap in {self.parts} parts of the surface"
         if self.agree:
             return f"{seen}, and agree within the stated uncertainty (probability {self.probability:.2g})"
         if self.scatter > POOR_FIT:
-            why = f"{self.scatter:.1f} times their noise: the scene moved, or the poses err by more than stated"
+            why = f"{self.scatter:.1f} times their noise: the scene moved, or the poses have larger errors than stated"
         else:
             why = f"(probability {self.probability:.1g}): most of it would follow from an error of {self.cause}"
-        return f"{seen}, and disagree beyond the stated uncertainty, {why}; uwlts recalibrate tells more"
+        return f"{seen}, and disagree beyond the stated uncertainty, {why}; uwlts recalibrate shows more"
 
 
 def split_passes(cloud: PointCloud) -> np.ndarray:

@@ -422,7 +422,7 @@ def _find_doubts(problem: PassProblem, solution: PassSolution, by_amplitudes: np
             "another scene or mirrored"
         )
     doubts += [
-        f"{each.name} hardly agrees with the others: only {100 * used:.0f} % of its points lie on a surface that "
+        f"{each.name} does not agree with the others: only {100 * used:.0f} % of its points lie on a surface that "
         "another pass sees: it is mirrored, of another scene, its pose is wrong, or it overlaps too little"
         for each, used in zip(problem.passes, solution.used, strict=True)
         if used < _APART * solution.used.max()

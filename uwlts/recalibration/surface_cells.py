@@ -35,7 +35,7 @@ class PassPoints:
     """Points of all passes (N) in the common frame, at corrected observations.
 
     ``places_mm`` (N, 3), ``number`` (N,) is that of the pass, ``by_unknowns`` (N, 3, U), ``by_px`` (N, 3) and
-    ``correction_px`` (N,) of the stripe centre. ``noise_px`` (N,) is its standard deviation, ``image_mm`` (K, N, 3)
+    ``correction_px`` (N,) of the stripe centre. ``noise_px`` (N,) is its standard deviation. ``image_mm`` (K, N, 3) are
     the shifts by one standard deviation of each error of the image's place, and ``image`` (N,) the number of the image.
     """
 
