@@ -345,7 +345,10 @@ def _gather(
         travel[even],
         of_images if pose is None else pose @ of_images,
     )
-    return found_pass, cloud.warnings
+    warnings = list(cloud.warnings)
+    if scan.header.T_platform_sensor is not None:
+        warnings.append("the mount counts as exact: the stated uncertainty of the poses must contain that of the mount")
+    return found_pass, warnings
 
 
 def summarise(
