@@ -1,4 +1,4 @@
-"""Analyses of the folder's files in a worker process: reconstruct, inspect, compare, register and export.
+"""Analyses of the folder's files in a worker process: reconstruct, inspect, compare, register, recalibrate and export.
 
 An analysis writes into a hidden folder. Its files are moved to their places when all of them are complete.
 """
@@ -38,6 +38,8 @@ _FILES: Mapping[str, str] = MappingProxyType(
         "calibration": "calibration",
         "cloud": "cloud",
         "clouds": "cloud",
+        "passes": "capture",
+        "poses": "table",
         "file": "cloud",
         "reference": "cloud",
         "datum": "cloud",
@@ -52,6 +54,7 @@ _LABELS = {
     "order": "order with limits",
     "measured": "measured values",
     "pdf": "also as PDF",
+    "pose_std_deg": "pose std, deg",
 }
 """Labels of fields whose parameters have no telling names."""
 SHAPES = ("plane", "sphere", "cylinder")
@@ -172,6 +175,14 @@ def _register(job: AnalysisJob, progress: ProgressListener) -> AnalysisOutcome:
     return AnalysisOutcome(tuple(found.lines()))
 
 
+def _recalibrate(job: AnalysisJob, progress: ProgressListener) -> AnalysisOutcome:
+    found = uwlts.recalibrate(**job.values, progress=progress)
+    uwlts.report.write_recalibration(job.path(".html"), found)
+    if not found.doubts:
+        found.calibration.save(job.path(".json"))
+    return AnalysisOutcome(tuple(found.lines()), warnings=(*found.warnings, *found.doubts))
+
+
 def _export(job: AnalysisJob, progress: ProgressListener) -> AnalysisOutcome:
     values = dict(job.values)
     ending = values.pop(_FORMAT)
@@ -217,6 +228,12 @@ ANALYSES: Mapping[str, Analysis] = MappingProxyType(
             "-registered",
             (".html", ".registration.json", f"-merged{_CLOUD}"),
         ),
+        "recalibrate": Analysis(
+            _recalibrate,
+            ((uwlts, "recalibrate", ("passes", "calibration", "pose_std_mm", "pose_std_deg", "poses")),),
+            "-recalibrated",
+            (".html", ".recalibration.json", ".json"),
+        ),
         "export": Analysis(_export, ((uwlts, "export", ("file", "at_most")),), "-export"),
     }
 )
@@ -237,7 +254,7 @@ def list_fields(kind: str) -> list[AnalysisField]:
                     described[name].replace("`", ""),
                     parameters[name].default is inspect.Parameter.empty,
                     file_kind=_FILES.get(name, ""),
-                    several=name == "clouds",
+                    several=name in ("clouds", "passes"),
                     switch=option_type(hints[name]) is bool,
                     choices=SHAPES if name == "reference" else (),
                 )
@@ -350,7 +367,7 @@ class Analyses:
     def _run(self, job: AnalysisJob, inputs: Sequence[Path], targets: Sequence[Path], overwrite: bool) -> None:
         board, title = self._board, self.state.title
         try:
-            outcome = self._analyse(job, inputs, targets, overwrite)
+            outcome, names = self._analyse(job, inputs, targets, overwrite)
         except _Cancelled:
             self.state = replace(self.state, running=False, error="cancelled; nothing was written")
             board.say(f"cancelled: {title}", "warning")
@@ -362,19 +379,18 @@ class Analyses:
             self.state = replace(self.state, running=False, error=f"a bug in the program: {error}")
             board.say(f"a bug in the program: {type(error).__name__}: {error}", "error")
         else:
-            names = tuple(each.name for each in targets)
             for warning in outcome.warnings:
                 board.say(warning, "warning")
             self.state = replace(self.state, running=False, outcome=outcome, files=names)
             board.say(f"wrote {', '.join(names)}")
-            for each in targets:
-                if each.name.endswith((".ply", _CLOUD)):
-                    self._show(each)
+            for name in names:
+                if name.endswith((".ply", _CLOUD)):
+                    self._show(self._folder / name)
 
     def _analyse(
         self, job: AnalysisJob, inputs: Sequence[Path], targets: Sequence[Path], overwrite: bool
-    ) -> AnalysisOutcome:
-        """Run the worker process, and move its files to their places."""
+    ) -> tuple[AnalysisOutcome, tuple[str, ...]]:
+        """Run the worker process, and move its files to their places; return their names too."""
 
         def hear(message: tuple[int, int, str]) -> None:
             done, total, stage = message
@@ -394,6 +410,8 @@ class Analyses:
                 for each in targets:
                     if each.exists() and not overwrite:
                         raise OutputError(f"{each.name} has appeared meanwhile: give another name")
-                for each in targets:
+                # A calibration that is doubted is not written.
+                made = [each for each in targets if (Path(aside) / each.name).exists()]
+                for each in made:
                     os.replace(Path(aside) / each.name, each)
-        return outcome
+        return outcome, tuple(each.name for each in made)

@@ -10,8 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from tests.system.in_process import uwlts
 from tests.uwlts.joint_views import seen
+from tests.waiting import within
 from twin.scene.campaign import replace_values
 from uwlts.calibration.joint.stored_estimate import read_stored_estimate
+from uwlts.desk.analyses import Analyses
+from uwlts.desk.shown_state import Board
 from uwlts.errors import CalibrationError, EvaluationError
 from uwlts.model.artefacts import PipeStandard, PlaneStandard
 from uwlts.model.library import load_sensor
@@ -318,6 +321,24 @@ def test_the_command_writes_a_calibration_only_without_doubts(tmp_path, monkeypa
     assert not (tmp_path / "new.json").exists()
     write_poses(poses, np.array([np.eye(4)] * 2), overwrite=True)
     assert "2 poses are given for 3 passes" in uwlts(*command).stderr
+
+
+def test_the_desk_recalibrates_and_says_which_pass_comes_next(tmp_path):
+    *_, problem = campaign(9, SHIFTED)
+    for each in problem.passes:
+        write_capture(tmp_path / f"{each.name}.h5", each)
+    as_built(SENSOR, WATER).save(tmp_path / "drawing.json")
+    write_poses(tmp_path / "poses.csv", np.array([pose_of(*pose) for pose in SHIFTED.values()]))
+    desk = Analyses(tmp_path, Board("test"), lambda path: None)
+    given = {"passes": [f"{name}.h5" for name in SHIFTED], "calibration": "drawing.json", "poses": "poses.csv"}
+    desk.start("recalibrate", given | {"pose_std_mm": 0.01, "pose_std_deg": 0.005}, name="", overwrite=False)
+    assert within(300.0, lambda: not desk.state.running)
+    desk.close()
+    assert desk.state.error == ""
+    name = "first-recalibrated"
+    assert desk.state.files == (f"{name}.html", f"{name}.recalibration.json", f"{name}.json")
+    assert any(line.startswith("next pass: ") for line in desk.state.outcome.lines)
+    assert read_calibration(tmp_path / f"{name}.json").joint is not None
 
 
 def survey(path, built_passes, *, moved_mm=0.0):
