@@ -25,8 +25,7 @@ from uwlts.runtime.workers import Lost, open_workers
 
 AT_ONCE = 2
 """Number of parallel commands of a stage: only rendering uses all processors by itself."""
-_STEP_IMAGES = 5
-"""Fewer images of a step standard belong to a calibration; a scan has at least this many profiles."""
+_STEP_IMAGES = 5  # fewer images of a step standard belong to a calibration; a scan has at least this many profiles
 
 COLOURED = "coloured.ply"
 """End of the names of clouds with the colours of their deviations."""

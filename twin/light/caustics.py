@@ -21,10 +21,8 @@ _TENSION_MM3_S2 = 7.3e4
 """Surface tension of water divided by its density (0.073 N/m, 1000 kg/m3)."""
 _PEAK = 0.877
 """Angular frequency of the longest waves times the wind speed, divided by gravity (Pierson and Moskowitz 1964)."""
-_SUN_RAD = 4.65e-3
-"""Angular radius of the sun (half of 32 arc minutes)."""
-_DIRECT = 0.9
-"""Fraction of the daylight that comes directly from the sun under a clear sky."""
+_SUN_RAD = 4.65e-3  # angular radius of the sun (half of 32 arc minutes)
+_DIRECT = 0.9  # fraction of the daylight that comes directly from the sun under a clear sky
 _STEP_MM = 4.0
 _FAST_MM_S = 500.0
 """Exposures are divided so that waves, at this typical speed, advance by at most `_STEP_MM`."""

@@ -276,8 +276,7 @@ def _bound_slope(x: Float) -> Float:
 
 RING_MM = 22.0, 28.0
 """Inner and outer radius of the ring in the plane of the entrance pupil, around a C-mount lens (assumed)."""
-_CELL_PX = 4
-"""Spacing of the computed pixels: at the distance of the reflected ring, the blur is many times wider."""
+_CELL_PX = 4  # spacing of the computed pixels: at the distance of the reflected ring, the blur is many times wider
 _PUPIL_SAMPLES = 128
 """Number of rays per computed pixel: a blurred edge has steps of a hundredth of the ring's brightness."""
 

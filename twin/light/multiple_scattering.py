@@ -36,10 +36,8 @@ NOISE_SHARES = (0.05, 0.2)
 _NARROWEST_CELLS = 0.7
 """Standard deviation in cells of the least blurred images of stripe and haze; each further one is three times as wide.
 """
-_WALKS_BESIDE_STRIPE = 8
-"""Factor on the number of walks beside the stripe, where the light is bright and steep."""
-_CELLS_BESIDE_STRIPE = 2
-"""Width in cells of the border of the stripe that takes more walks."""
+_WALKS_BESIDE_STRIPE = 8  # factor on the number of walks beside the stripe, where the light is bright and steep
+_CELLS_BESIDE_STRIPE = 2  # width in cells of the border of the stripe that takes more walks
 _WALKS_IN_STRIPE = 4
 """Factor on the number of walks in the small cells of the stripe; 1 if neighbouring cells determine the light there."""
 

@@ -158,8 +158,7 @@ GAUSSIANS = 8
 """Number of Gaussians, with standard deviations in steps of about 1.6: their sum is the profile to 2 % of its peak."""
 _TAILS = (0.08, 0.999)
 """Fractions of the light between which the Gaussians are spaced; the first and the last take over the rest."""
-_DEPTHS = 32
-"""Number of depths of the first scattering (Gauss-Laguerre quadrature)."""
+_DEPTHS = 32  # number of depths of the first scattering (Gauss-Laguerre quadrature)
 
 
 @dataclass(frozen=True)

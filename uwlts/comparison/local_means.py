@@ -41,8 +41,7 @@ OPTIONS = ComparisonOptions()
 
 TWO_SIDED = 1.96
 """Standard normal quantile of 97.5 %."""
-_NEARLY_NORMAL = 200
-"""Least number of points with Student's quantile within 1 % of the normal one."""
+_NEARLY_NORMAL = 200  # least number of points with Student's quantile within 1 % of the normal one
 _PAIRS_AT_A_TIME = 2_000_000  # to limit memory
 
 

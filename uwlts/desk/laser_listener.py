@@ -34,10 +34,8 @@ MESSAGE_BYTES = 4096
 _SOFT_RESET = b"\x18"
 _ESCAPE_S = 0.2
 """Escape also closes menus. Within this time the program may answer; otherwise the laser is switched off."""
-_AGAIN_S = 0.2
-"""Interval between repetitions of Ctrl-X: a command in progress may have switched the laser on again."""
-_GIVE_UP_S = 2.0
-"""A press has failed if no port has accepted Ctrl-X and the program has not answered for this time."""
+_AGAIN_S = 0.2  # interval between repetitions of Ctrl-X: a command in progress may have switched the laser on again
+_GIVE_UP_S = 2.0  # a press has failed if no port has accepted Ctrl-X and the program has not answered for this time
 _WATCH_S = 0.2  # period in which its state is looked at
 
 

@@ -30,8 +30,7 @@ from uwlts.storage.point_cloud2 import (
     point_cloud2,
 )
 
-_QUEUED = 100
-"""Messages that a slow subscriber may be behind: 10 s of a camera with 10 images a second."""
+_QUEUED = 100  # messages that a slow subscriber may be behind: 10 s of a camera with 10 images a second
 _WHEELS = ("ros-rclpy", "ros-rmw-fastrtps-cpp", "ros-sensor-msgs", "ros-std-srvs")
 """Wheels with ROS 2 for Python on Linux, from PyPI."""
 

@@ -35,11 +35,9 @@ from uwlts.storage.capture import CAPTURES, CaptureHeader, Frame, part_path
 from uwlts.storage.cloud import PointCloud
 from uwlts.stripe import find_stripe, warm_up
 
-_POLITE = 10
-"""Reduction of the page's priority in favour of the recording, as by ``nice``."""
+_POLITE = 10  # reduction of the page's priority in favour of the recording, as by ``nice``
 _PATIENCE_S = 5.0  # for a process to end
-_SIGNAL_WHEN_PARENT_ENDS = 1
-"""PR_SET_PDEATHSIG of Linux's prctl."""
+_SIGNAL_WHEN_PARENT_ENDS = 1  # PR_SET_PDEATHSIG of Linux's prctl
 
 
 def scan(

@@ -46,8 +46,7 @@ MONO_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono14": 14, "Mono16": 16}
 """Bit depths of the grey formats. Packed formats are omitted: few cameras offer only them."""
 COORDINATE_BITS = 16
 """Bit depth of the values in `CENTRE_LINES`."""
-_WAIT_S = 0.1
-"""Longest single wait in a driver's library, during which Ctrl-C has no effect."""
+_WAIT_S = 0.1  # longest single wait in a driver's library, during which Ctrl-C has no effect
 # GigE Vision 1.x counts frames in 16 bits and skips 0.
 _COUNTER_16_BIT = 2**16 - 1
 

@@ -20,8 +20,7 @@ GRACE_S = 0.8
 and the guard needs a few ms to wake up and send."""
 BEAT_S = 0.1
 """Longest time between two beats in a waiting loop."""
-_ANSWER_S = 0.5
-"""Time limit of the guard's answer, which takes less than 1 ms unless the guard is suspended."""
+_ANSWER_S = 0.5  # time limit of the guard's answer, which takes less than 1 ms unless the guard is suspended
 _END_S = 3.0  # for the guarding process to end
 
 GuardState = Literal["watching", "switched off", "gone"]

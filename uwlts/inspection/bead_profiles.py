@@ -125,8 +125,7 @@ def _quadratic_row(u: np.ndarray) -> np.ndarray | None:
     return np.linalg.solve(normal, np.eye(3)[0]) @ (design * weight[:, None]).T
 
 
-_DRAWS = 2000
-"""Noise draws: fifty exceed the 97.5 % quantile, which is then known to a tenth of a standard deviation."""
+_DRAWS = 2000  # noise draws: fifty exceed the 97.5 % quantile, which is then known to a tenth of a standard deviation
 BIAS_FACTOR = 1 / (np.sqrt(2) - 1)
 """Bias by the noise divided by the increase when the noise is added once more, for a bias proportional to its std."""
 

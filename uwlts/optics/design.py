@@ -33,15 +33,11 @@ Array = Any
 Vector = tuple[Array, Array, Array]
 
 _NEWTON_STEPS = 4  # of the ray through the window; converges quadratically
-_UNDISTORTING_STEPS = 100
-"""Largest number of iterations; strong distortion converges slowly."""
-_UNDISTORTED_PX = 1e-3
-"""Tolerance of undistorted points, sufficient for a drawing."""
-_TINY_MM = 1e-9
-"""Offset that avoids an undefined direction for a point on the window's normal; negligible."""
+_UNDISTORTING_STEPS = 100  # largest number of iterations; strong distortion converges slowly
+_UNDISTORTED_PX = 1e-3  # tolerance of undistorted points, sufficient for a drawing
+_TINY_MM = 1e-9  # offset that avoids an undefined direction for a point on the window's normal; negligible
 _EDGE_STEPS = 5  # Newton steps to an edge of the image; converges quadratically from a close start
-_NEAREST_MM = 1.0
-"""Least distance of the sheet's entry into the image from the window's outer face."""
+_NEAREST_MM = 1.0  # least distance of the sheet's entry into the image from the window's outer face
 FARTHEST_MM = 1e6
 """Largest distance of the sheet's exit from the image, from the pupil; no water is transparent as far."""
 CLAMPED, UNCLAMPED = 0.75, 1.125

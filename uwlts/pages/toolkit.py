@@ -323,8 +323,7 @@ def typeset_number(text: str) -> str:
 BROWSERS = ("chromium", "chromium-headless-shell", "google-chrome", "google-chrome-stable", "msedge")
 """Names of browsers on PATH; the environment variable CHROMIUM names another one."""
 
-_PATIENCE_S = 120.0
-"""Time limit: a page with a few pictures takes 2 s, or much longer on a slow machine."""
+_PATIENCE_S = 120.0  # time limit: a page with a few pictures takes 2 s, or much longer on a slow machine
 
 
 def print_pdf(page: str, path: Path, *, overwrite: bool = False) -> None:

@@ -22,8 +22,7 @@ PLACES_FORMATS = (".ply", ".laz", ".las")
 """Supported endings of the coloured cloud."""
 _COLOURS = colormaps["RdBu"]
 _NOT_SIGNIFICANT = "#cccccc"
-_INK = 60_000
-"""Total area of all dots (square points), such that they nearly touch."""
+_INK = 60_000  # total area of all dots (square points), such that they nearly touch
 _COLUMNS = (
     "region",
     "centre / mm",
@@ -173,8 +172,7 @@ def _histogram(change: SurfaceChange) -> Markup:
     return figure_svg(figure)
 
 
-_SHOWN = 30_000
-"""Number of points shown per picture for all scans together; more would overlap."""
+_SHOWN = 30_000  # number of points shown per picture for all scans together; more would overlap
 _VIEWS = ((0, 1), (0, 2), (1, 2))  # axes of plan, front and side view
 
 

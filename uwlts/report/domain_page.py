@@ -26,10 +26,8 @@ from uwlts.stripe import StripeSettings
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_SHOWN = 8
-"""Pictures of each set."""
-_GAMMA = 0.5
-"""Exponent of the displayed brightness, which makes a halo visible."""
+_SHOWN = 8  # pictures of each set
+_GAMMA = 0.5  # exponent of the displayed brightness, which makes a halo visible
 
 
 def write_domain_gap(

@@ -282,8 +282,7 @@ _SIDES = np.array([4.0, 2.0, 1.0])
 usually lie, are at least 7 deg away from those at which the choice changes."""
 _ACROSS = 0.1
 """Least component of a direction along a pipe, or of 12 o'clock across it: nearer ones (6 deg) follow the noise."""
-_UPRIGHT = 0.3
-"""Component of 12 o'clock (-Z) across a pipe below which +X replaces it: pipes within 17 deg of Z."""
+_UPRIGHT = 0.3  # component of 12 o'clock (-Z) across a pipe below which +X replaces it: pipes within 17 deg of Z
 
 
 def resolve_datum(datum: FindingDatum, axis: np.ndarray) -> tuple[np.ndarray, np.ndarray, str | None]:

@@ -196,10 +196,8 @@ def window_choices(
 TEMPERATURE_HALF_WIDTH_C = 5.0  # the thesis's 5 K
 _EXPANSION_PER_K = 22.2e-6
 """Thermal expansion of the standard: the thesis's 0.011 mm for 5 K and 99.18 mm, as for aluminium."""
-_STANDARD_EXPANDED_MM = 0.004
-"""Expanded uncertainty of its calibration, k = 2 (thesis, Table 9)."""
-_SUBPIXEL = 0.1
-"""Effective resolution in px, from the thesis."""
+_STANDARD_EXPANDED_MM = 0.004  # expanded uncertainty of its calibration, k = 2 (thesis, Table 9)
+_SUBPIXEL = 0.1  # effective resolution in px, from the thesis
 
 
 def spacing_budget(
@@ -254,8 +252,7 @@ def mm_per_px(calibration: Calibration, medium_index: float) -> float:
 
 BUDGET = "budget of the sphere spacing"
 """Name of the budget's figures in the column ``scan``."""
-_LOW_PASS = {"low_pass": 0.4}
-"""Settings of the thesis's stripe detection."""
+_LOW_PASS = {"low_pass": 0.4}  # settings of the thesis's stripe detection
 
 
 def evaluate_thesis(

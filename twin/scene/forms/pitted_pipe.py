@@ -9,16 +9,12 @@ from twin.scene.forms.triangles import chord_step, require_few_vertices, space_a
 from twin.scene.scene_object import FreeForm, Range
 from uwlts.model.sensor import NotNegative, Positive
 
-_PIT_SAG_MM = 0.01
-"""Largest distance of a pitted pipe's facets from its surface."""
-_DRAWN_PIT_SAG_MM = 0.002
-"""The same for pits of drawn depths, which may be as shallow as the noise of points."""
-_PITTED_DEG = 60.0
-"""Pits are within this angle of the side that faces the sensor."""
+_PIT_SAG_MM = 0.01  # largest distance of a pitted pipe's facets from its surface
+_DRAWN_PIT_SAG_MM = 0.002  # the same for pits of drawn depths, which may be as shallow as the noise of points
+_PITTED_DEG = 60.0  # pits are within this angle of the side that faces the sensor
 _MOST_COVERED = 0.45
 """Largest share of the area that discs with gaps may cover; random placing ends at 0.547 (Feder 1980)."""
-_DEPTHS_STREAM = 1
-"""Stream of random numbers of depths, separate from that of positions."""
+_DEPTHS_STREAM = 1  # stream of random numbers of depths, separate from that of positions
 
 
 class PittedPipe(FreeForm):

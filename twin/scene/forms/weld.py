@@ -9,12 +9,10 @@ from twin.scene.forms.triangles import chord_step, grid_faces, nodes, require_fe
 from twin.scene.scene_object import FreeForm, Range
 from uwlts.model.sensor import NotNegative, Positive
 
-_TRAIL = 1 / 3
-"""Lag of the ripples at a bead's toes, in units of its width."""
+_TRAIL = 1 / 3  # lag of the ripples at a bead's toes, in units of its width
 _DEPTHS_STREAM = 1_000_000
 """Stream of random numbers of undercuts, separate from those of beads, which are numbered from 0."""
-_SAG_MM = 0.004
-"""Largest distance of a weld's facets from its surface."""
+_SAG_MM = 0.004  # largest distance of a weld's facets from its surface
 
 
 class Weld(FreeForm):
