@@ -36,10 +36,8 @@ from uwlts.optics.design import (
     window_thickness_mm,
 )
 
-DEPTHS = 5
-"""Number of evaluated depths, evenly spaced over the part of the measuring volume in the camera's view."""
-PLACES = 7
-"""Number of evaluated points along the stripe at each depth."""
+DEPTHS = 5  # number of evaluated depths, evenly spaced over the part of the measuring volume in the camera's view
+PLACES = 7  # number of evaluated points along the stripe at each depth
 _MANY = 200  # least number of designs that is worth the time to compile the formulas
 _BLOCK = 1000  # number of designs in a block of the compiled formulas
 _BRIGHT_LINES = 2.05

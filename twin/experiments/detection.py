@@ -25,8 +25,7 @@ from uwlts.errors import CaptureError
 Flaw = Literal["pit", "dent", "undercut"]
 Method = Literal["hit/miss", "signal response"]
 
-FEWEST = {"hit/miss": 60, "signal response": 40}
-"""Fewest flaws of an experiment (MIL-HDBK-1823A, 4.5.2.2)."""
+FEWEST = {"hit/miss": 60, "signal response": 40}  # fewest flaws of an experiment (MIL-HDBK-1823A, 4.5.2.2)
 _DENT_SHARE = 0.1
 """Width of a dent, as a fraction of the pipe's diameter; narrower hollows are pits, as `uwlts inspect` names them."""
 _PLACE_MM = 1.0  # largest distance of a finding from the rim of its pit: errors of calibration and of the deepest place

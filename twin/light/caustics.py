@@ -10,8 +10,7 @@ import numpy as np
 
 from twin.scene.platform_kinds import GRAVITY_M_S2
 
-PATCH_MM = 512.0
-"""Period of the surface; the focus of longer waves is at depths of many metres."""
+PATCH_MM = 512.0  # period of the surface; the focus of longer waves is at depths of many metres
 CELLS = 1024
 """Number of cells of the pattern along each axis: 0.5 mm each, narrower than the sun's blur 0.2 m below the surface."""
 _SHORTEST_MM = 17.0

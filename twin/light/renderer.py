@@ -49,8 +49,7 @@ from twin.scene.platforms import Light as LightName
 from uwlts.model.placement import camera_from_object, check_design
 from uwlts.model.sensor import Medium, Sensor
 
-SAMPLES_AT_ONCE = 2**23
-"""Largest number of samples rendered together; this many take about 100 MB."""
+SAMPLES_AT_ONCE = 2**23  # largest number of samples rendered together; this many take about 100 MB
 CHANGE_SHARE = 2e-3
 """In lamp images, pixels are sampled finely if their corners differ by more than this fraction of the maximum."""
 BEND_SHARE = 1e-3

@@ -42,8 +42,7 @@ _PATCH_VALUES = 8  # columns of the table of patches; the last two are padding, 
 _WAVES_AT_ONCE = 4
 """Number of waves read together, which takes a third less time than one by one; more are not read faster."""
 _ROUNDING_MM = 1e-3  # bound of the single-precision rounding error of positions on a plate of 1 m
-COAT_INDEX = {"painted": 1.50, "pvc": 1.54}
-"""Refractive indices in air of an alkyd or acrylic binder, and of rigid PVC."""
+COAT_INDEX = {"painted": 1.50, "pvc": 1.54}  # refractive indices in air of an alkyd or acrylic binder, and of rigid PVC
 
 # Wavelength in nm, n and k of iron at room temperature: Johnson and Christy 1974, Phys. Rev. B 9:5056.
 _IRON = np.array(

@@ -28,11 +28,9 @@ from uwlts.model.sensor import Camera, Detector, Sensor
 from uwlts.runtime.compiled import compiled
 from uwlts.runtime.workers import count_processors
 
-PLANCK_TIMES_LIGHT = 6.62607015e-34 * 299792458.0
-"""h c in J m (SI, exact)."""
+PLANCK_TIMES_LIGHT = 6.62607015e-34 * 299792458.0  # h c in J m (SI, exact)
 
-MOST_ELECTRONS = 1e15
-"""Upper limit, far above any real pixel; larger Poisson numbers would not fit into 64 bits."""
+MOST_ELECTRONS = 1e15  # upper limit, far above any real pixel; larger Poisson numbers would not fit into 64 bits
 
 _BANDS = 8  # number of bands of rows with independent random numbers, and of parallel tasks
 _PARALLEL_PX = 2**19
@@ -238,10 +236,8 @@ def _sweep(charge: np.ndarray, full_well_e: float, share: float) -> np.ndarray:
 # --- 3D cameras -------------------------------------------------------------------------------------------------------
 
 
-INVALID = 0
-"""Number of a line without a stripe."""
-THRESHOLD = 0.06
-"""Fraction of the full scale above which pixels count: above the noise, as usual for such cameras."""
+INVALID = 0  # number of a line without a stripe
+THRESHOLD = 0.06  # fraction of the full scale above which pixels count: above the noise, as usual for such cameras
 _FEWEST_PX = 2  # smallest width of a stripe; narrower peaks are hot pixels
 _REACH_PX = 64  # largest distance of a stripe's edge from its brightest pixel
 

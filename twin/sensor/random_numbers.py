@@ -15,8 +15,7 @@ from uwlts.runtime.compiled import compiled, compiled_part
 
 POISSON_STEP = 0.125
 """Step of the means tabulated by `poisson_numbers`; smaller steps need a larger table and fewer events."""
-LARGEST_MEAN = 32.0
-"""NumPy generates numbers with means from here on."""
+LARGEST_MEAN = 32.0  # NumPy generates numbers with means from here on
 _LEVELS = int(LARGEST_MEAN / POISSON_STEP)
 _CELLS = 4096
 """Cells of the unit interval in a table; twelve bits of a random number select one."""

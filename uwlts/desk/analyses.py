@@ -53,8 +53,7 @@ _LABELS = {
     "pdf": "also as PDF",
 }
 """Labels of fields whose parameters have no telling names."""
-SHAPES = ("plane", "sphere", "cylinder")
-"""Ideal shapes, which a reference may be instead of a file."""
+SHAPES = ("plane", "sphere", "cylinder")  # ideal shapes, which a reference may be instead of a file
 _FORMAT = "format"  # field for the format of an export: the ending of its file
 
 

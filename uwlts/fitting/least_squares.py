@@ -15,18 +15,15 @@ from scipy.optimize import least_squares
 from uwlts.errors import EvaluationError
 from uwlts.model.calibration import rigid_transform
 
-MAD_TO_STD = 1.4826
-"""Standard deviation of a normal distribution divided by its median absolute deviation."""
+MAD_TO_STD = 1.4826  # standard deviation of a normal distribution divided by its median absolute deviation
 
 TUKEY_BOUND = 4.685
 """Bound of Tukey's biweight, in standard deviations: 95 % efficient for normal noise (Holland and Welsch,
 Communications in Statistics A 6, 1977)."""
 
-VDI_OUTLIER_SHARE = 0.003
-"""VDI/VDE 2634 permits rejecting at most 0.3 % of the points."""
+VDI_OUTLIER_SHARE = 0.003  # VDI/VDE 2634 permits rejecting at most 0.3 % of the points
 
-DEFAULT_K = 5.0
-"""Rejection limit in standard deviations: 6 in ten million points of normal noise exceed it."""
+DEFAULT_K = 5.0  # rejection limit in standard deviations: 6 in ten million points of normal noise exceed it
 
 _RETURNING_ROUNDS = 20  # rounds after which rejected points no longer return, so that the iteration ends
 

@@ -338,8 +338,7 @@ class PatchErrors:
         return csr_array((values.ravel(), self.near.ravel(), ends), shape=(len(self.near), len(self.counts)))
 
 
-POINTS_PER_DISC = 30
-"""Number of points of an averaging disc: the mean has about a fifth of their noise."""
+POINTS_PER_DISC = 30  # number of points of an averaging disc: the mean has about a fifth of their noise
 _IMAGES_PER_DISC = 3.0  # least number of images in a disc, so that errors of single images average
 _SAMPLED = 2000  # number of points for the median spacing, which is then accurate to a few percent
 _ASKED = 64  # number of points for the median distance between images

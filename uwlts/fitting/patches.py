@@ -35,8 +35,7 @@ _FACING = 0.15
 
 LEAST_INFORMATION = 5.0
 """Least information on a determined motion, relative to the information that noise of the normals alone produces."""
-ROUNDING = 1e-9
-"""Least information above rounding noise, relative to the information on the best determined motion."""
+ROUNDING = 1e-9  # least information above rounding noise, relative to the information on the best determined motion
 
 
 @dataclass(frozen=True, eq=False)

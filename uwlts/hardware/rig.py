@@ -26,8 +26,7 @@ from uwlts.stripe import Stripe, StripeStatus, extract_stripe
 
 BRIGHT_SHARE = 0.98
 """Quantile of the peak values of the considered lines; 2 % of the lines may be brighter than requested."""
-START_MS = 1.0
-"""First exposure: in the middle of the usual range, on a logarithmic scale."""
+START_MS = 1.0  # first exposure: in the middle of the usual range, on a logarithmic scale
 _FEW_SHARE = 0.01
 _FEWEST_LINES = 3
 """Smallest fraction and number of lines with a stripe; fewer are attributed to a reflection or noise."""

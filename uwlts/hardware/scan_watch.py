@@ -22,8 +22,7 @@ from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Seen
 from uwlts.stripe import Stripe, StripeStatus
 
-LOOKS = 9
-"""Number of positions searched for a stripe before a scan is given up."""
+LOOKS = 9  # number of positions searched for a stripe before a scan is given up
 _DROP = 0.5  # a stripe whose number of lines or level is below this fraction of the previous image's is checked
 _AGAIN = 25  # number of images without a stripe after which the laser is checked again
 _SAME_PX = 1.0  # stripes of two images within this distance are the same; edges caused by noise are displaced more
@@ -127,8 +126,7 @@ class LaserWatch:
         )
 
 
-LARGEST_MM = 0.05
-"""Largest slip that is not reported: four steps of 0.0125 mm, comparable with the sensor's errors."""
+LARGEST_MM = 0.05  # largest slip that is not reported: four steps of 0.0125 mm, comparable with the sensor's errors
 _LEAST_RELIEF = 0.2
 """Smallest motion of the stripe in px per mm of the stage on lines that are used; below it noise dominates."""
 _LARGEST_BEND_PX = 2.0  # a larger change of the motion between two images is caused by an edge

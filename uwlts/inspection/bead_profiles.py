@@ -23,8 +23,7 @@ from uwlts.inspection.features import COVERAGE, COVERAGE_FACTOR, SEED
 
 NODES = (-np.sqrt(3.0), 1 / 6), (0.0, 2 / 3), (np.sqrt(3.0), 1 / 6)
 """Places and weights of a normal distribution (Gauss-Hermite, exact to the fifth power)."""
-NO_WEIGHT = 1e-9
-"""Sum of absolute weights that counts as zero: rounding errors are smaller."""
+NO_WEIGHT = 1e-9  # sum of absolute weights that counts as zero: rounding errors are smaller
 
 
 @dataclass(frozen=True, eq=False)

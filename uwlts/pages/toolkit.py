@@ -52,8 +52,7 @@ import tempfile
 
 from uwlts.errors import SetupError
 
-MISSING = "-"
-"""Placeholder for a missing value in tables of text."""
+MISSING = "-"  # placeholder for a missing value in tables of text
 
 INK, SOFT, FAINT, BLUE, RED = "#2b3440", "#5c6875", "#dde2e8", "#3573b1", "#b5303c"
 """Colours of text, notes, grid lines, and of the main and the contrasting line, as in ``style.css``."""
@@ -111,8 +110,7 @@ def render_page(package: str, template: str, /, *, interactive: FigureCollector 
     )
 
 
-HTML = (".html", ".htm")
-"""File name endings of pages."""
+HTML = (".html", ".htm")  # file name endings of pages
 
 
 def write_page(

@@ -18,8 +18,7 @@ from uwlts.report.plot import UNKNOWN, surface_limit_mm
 from uwlts.storage.cloud_files import PLY_COLOURS, write_ply_points
 from uwlts.storage.las_file import encode_las
 
-PLACES_FORMATS = (".ply", ".laz", ".las")
-"""Supported endings of the coloured cloud."""
+PLACES_FORMATS = (".ply", ".laz", ".las")  # supported endings of the coloured cloud
 _COLOURS = colormaps["RdBu"]
 _NOT_SIGNIFICANT = "#cccccc"
 _INK = 60_000  # total area of all dots (square points), such that they nearly touch
@@ -176,8 +175,7 @@ _SHOWN = 30_000  # number of points shown per picture for all scans together; mo
 _VIEWS = ((0, 1), (0, 2), (1, 2))  # axes of plan, front and side view
 
 
-REGISTRATION = "registration"
-"""Kind of the page, in the name of its JSON file."""
+REGISTRATION = "registration"  # kind of the page, in the name of its JSON file
 
 
 def write_registration(

@@ -24,12 +24,10 @@ from uwlts.pages.toolkit import MISSING, format_to_scale, render_page, write_pag
 
 FORMAT = "uwlts-measured-values"
 VERSION = 1  # of the file format
-MEASURED = "measured"
-"""Kind of the files, in their names."""
+MEASURED = "measured"  # kind of the files, in their names
 MEASURED_ENDINGS = tuple(f".{MEASURED}{ending}" for ending in (".html", ".json", ".csv"))
 """Endings of page, list and table."""
-COVERAGE_FACTOR = 2.0
-"""Coverage factor of the expanded uncertainties, that of `FigureUncertainty.expanded_mm`."""
+COVERAGE_FACTOR = 2.0  # coverage factor of the expanded uncertainties, that of `FigureUncertainty.expanded_mm`
 COLUMNS = ("name", "quantity", "value / mm", "U (k = 2) / mm", "lower limit", "upper limit", "verdict", "source")
 _SHOWN_MM = 1e-4
 """Precision of values without uncertainty."""

@@ -10,8 +10,7 @@ from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import robust_std
 from uwlts.shapes.flat import Circle
 
-LEAST_POINTS = 12
-"""Points on the artefact that a profile needs: four for each of a circle's three parameters."""
+LEAST_POINTS = 12  # points on the artefact that a profile needs: four for each of a circle's three parameters
 _TRIALS = 400
 """Curves proposed for a profile: with a tenth of it on the artefact and neighbouring proposals, some 40 are right."""
 _REJECTED_BEYOND = 4.0  # robust standard deviations; of normal noise, six points in a hundred thousand exceed it

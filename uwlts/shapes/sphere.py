@@ -20,8 +20,7 @@ from uwlts.fitting.least_squares import (
 from uwlts.fitting.local_surface import number_cubes
 from uwlts.shapes.flat import fit_algebraic_centres, initial_centre, prepare_round, unit_vectors
 
-LEAST_POINTS = 50
-"""Least number of points of a sphere."""
+LEAST_POINTS = 50  # least number of points of a sphere
 
 _SEARCH_LIMIT = 0.05  # half width (unit: radius) of the band of points that support a proposed sphere
 _LARGEST_LIMIT = 0.1  # largest half width (unit: radius) of the band of a sphere's points

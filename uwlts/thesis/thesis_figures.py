@@ -26,8 +26,7 @@ from uwlts.storage.capture import Capture, open_captures
 from uwlts.storage.figure_table import FigureTable, MeasuredFigure
 from uwlts.stripe import find_stripes
 
-UNIFORM = 1 / math.sqrt(3)
-"""Standard deviation of a uniform distribution divided by its half-width (GUM 4.3.7)."""
+UNIFORM = 1 / math.sqrt(3)  # standard deviation of a uniform distribution divided by its half-width (GUM 4.3.7)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -250,8 +249,7 @@ def mm_per_px(calibration: Calibration, medium_index: float) -> float:
     return float(abs(points[1, 2] - points[0, 2]))
 
 
-BUDGET = "budget of the sphere spacing"
-"""Name of the budget's figures in the column ``scan``."""
+BUDGET = "budget of the sphere spacing"  # name of the budget's figures in the column ``scan``
 _LOW_PASS = {"low_pass": 0.4}  # settings of the thesis's stripe detection
 
 

@@ -34,8 +34,7 @@ from uwlts.pages.toolkit import (
     render_page,
 )
 
-Interactive = tuple[go.Figure, str]
-"""Figure for a page, and its caption."""
+Interactive = tuple[go.Figure, str]  # figure for a page, and its caption
 
 _SYMBOLS = ("diamond", "circle", "star", "square", "cross")  # symbols of highlighted designs
 _SHOWN = (

@@ -40,8 +40,7 @@ from uwlts.targets import Target, parse_target
 FEWEST_IMAGES = 4
 """Three poses with rotations about two axes determine the mount; a fourth one shows whether they agree."""
 _LEAST_PX = 1e-3  # lower bound of the detection error of a corner or circle
-POSE_STEPS = np.array([1e-3] * 3 + [1e-6] * 3)
-"""Step sizes of shift (mm) and rotation (rad) for finite differences."""
+POSE_STEPS = np.array([1e-3] * 3 + [1e-6] * 3)  # step sizes of shift (mm) and rotation (rad) for finite differences
 _NO_FIT = 0.1  # pose error divided by the extent of the target that no platform has; a wrong pose format exceeds it
 _TRIPLES = 100
 """Random triples of images: with a third of the images wrong, all triples contain a wrong one once in 10^15 runs."""

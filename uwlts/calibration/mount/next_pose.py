@@ -17,8 +17,7 @@ from uwlts.model.mount import NextPose
 _TURN_RAD = np.radians(30)  # rotation that a robot easily makes with the artefact in view
 _LEAST_TURN_RAD = np.radians(5.0)  # RMS rotation about an axis below which a warning is given
 _OPEN_MM = 5.0  # standard uncertainty of a shift that counts as not determined: a ruler is better
-OPEN_RAD = np.radians(1.0)
-"""Standard uncertainty of a rotation that counts as not determined: a protractor is better."""
+OPEN_RAD = np.radians(1.0)  # standard uncertainty of a rotation that counts as not determined: a protractor is better
 _WEAK = 5.0  # ratio to the uncertainty of the best determined direction above which a further pose is advised
 _LEAST_MM = 0.01  # standard uncertainty of a shift below which no further pose is advised
 _LEAST_RAD = np.radians(0.005)  # the same for a rotation: 0.02 mm at 220 mm

@@ -13,8 +13,7 @@ from scipy.stats import f, t
 from uwlts.errors import CalibrationError
 
 _FALSE_ALARM = 1e-3  # probability that any pose of a campaign without wrong poses is rejected, for normal errors
-LARGEST_ROUGH = 6.0
-"""Multiple of the median misfit of a pose: of 45 normal poses, one in millions exceeds it."""
+LARGEST_ROUGH = 6.0  # multiple of the median misfit of a pose: of 45 normal poses, one in millions exceeds it
 _SETTLED = 0.01
 """Last step in standard uncertainties, and last change of the likelihood, too small to change any stated figure."""
 _SHRINKING = 0.7
