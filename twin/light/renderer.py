@@ -24,8 +24,16 @@ import numpy as np
 
 from twin.backend.arrays import Float, Point3f, UInt32, Vector4f, begin_kernels, opaque, to_jit
 from twin.light.camera import CameraView, RaySegment, trace_segments
-from twin.light.caustics import CELLS, PATCH_MM, Caustics
-from twin.light.illumination import Light, SheetCrossing, compute_haze, intersect_sheet, make_lights
+from twin.light.illumination import (
+    CELLS,
+    PATCH_MM,
+    Caustics,
+    Light,
+    SheetCrossing,
+    compute_haze,
+    intersect_sheet,
+    make_lights,
+)
 from twin.light.image_sampling import (
     NODE_SPACING_PX,
     combine_corners,

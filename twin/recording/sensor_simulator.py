@@ -6,8 +6,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from twin.light.caustics import Caustics
-from twin.light.illumination import reflect_ring
+from twin.light.illumination import Caustics, reflect_ring
 from twin.light.pose import Travel
 from twin.light.renderer import LaserFrame, Renderer
 from twin.recording.frame_truth import (

@@ -1,7 +1,8 @@
 """Platforms by kind: underwater vehicle, linear guide, rotary table, and robot arm, with the errors of their motion.
 
 Formulas of the vehicle follow T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control (Wiley, 2011;
-"Fossen"), and J. A. Farrell, Aided Navigation (McGraw-Hill, 2008; "Farrell")."""
+"Fossen"), and J. A. Farrell, Aided Navigation (McGraw-Hill, 2008; "Farrell").
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
