@@ -34,6 +34,9 @@ from uwlts.storage.cloud_files import PLY_COLOURS, write_ply_points
 from uwlts.storage.las_file import encode_las
 from uwlts.stripe import StripeSettings
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 PLACES_FORMATS = (".ply", ".laz", ".las")  # supported endings of the coloured cloud
 _COLOURS = colormaps["RdBu"]
 _NOT_SIGNIFICANT = "#cccccc"
@@ -296,9 +299,6 @@ def _histograms(registered: RegisteredScans) -> Markup:
 
 # --- domain gap -------------------------------------------------------------------------------------------------------
 
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _MOST_PIECES = 8  # pictures of each set
 _GAMMA = 0.5  # exponent of the displayed brightness, which makes a halo visible

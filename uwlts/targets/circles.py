@@ -180,9 +180,6 @@ def _orientation(
     )
 
 
-if TYPE_CHECKING:
-    from uwlts.targets.detection import Lattice
-
 _FEWEST = 0.75
 """Least fraction of the circles that must be found: dirt hides single ones; with fewer, the grid is another one."""
 _MOST_OTHERS = 0.02  # largest fraction of found circles outside the described grid: more are another grid
