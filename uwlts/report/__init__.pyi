@@ -3,7 +3,7 @@ from .acceptance_page import write_acceptance as write_acceptance
 from .camera_page import write_camera as write_camera
 from .certificate import check_certificate as check_certificate
 from .certificate_page import write_certificate as write_certificate
-from .comparison_pages import (
+from .change_page import (
     write_change as write_change,
     write_domain_gap as write_domain_gap,
     write_registration as write_registration,
