@@ -25,8 +25,7 @@ from uwlts.errors import ArgumentError, OutputError
 P = ParamSpec("P")
 R = TypeVar("R")
 
-_SHORT = Repr()
-"""Short texts of values, for messages."""
+_SHORT = Repr()  # short texts of values, for messages
 _SHORT.maxstring = _SHORT.maxother = 60
 
 

@@ -11,11 +11,9 @@ if TYPE_CHECKING:
     from pydantic import ValidationError
     from pydantic_core import ErrorDetails
 
-_MOST_PROBLEMS = 5
-"""Largest number of problems in a message; a damaged table would have one for each number."""
+_MOST_PROBLEMS = 5  # largest number of problems in a message; a damaged table would have one for each number
 
-_MOST_LISTED = 1000
-"""Largest number of problems that are examined: a list of a million would take a gigabyte."""
+_MOST_LISTED = 1000  # largest number of problems that are examined: a list of a million would take a gigabyte
 
 _LONGEST_PROBLEM = 300  # characters; foreign files are quoted in messages
 _LONGEST = 5000  # characters of a message

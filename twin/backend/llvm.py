@@ -23,12 +23,10 @@ from uwlts.errors import SetupError
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 MINIMUM_MAJOR = 17
 """Oldest version whose kernels do not abort."""
-RUNTIME_LIBRARY = "libatomic.so.1"
-"""Dr.Jit's wheel is linked against it; minimal systems without a compiler lack it."""
+RUNTIME_LIBRARY = "libatomic.so.1"  # Dr.Jit's wheel is linked against it; minimal systems without a compiler lack it
 TRIAL_SECONDS = 300
 """Time limit of the trial kernel: it takes a few seconds, but imports from a network drive may be slow."""
-SINGLE_PRECISION_INTEGERS = 2**24
-"""Integers below this are exact in single precision."""
+SINGLE_PRECISION_INTEGERS = 2**24  # integers below this are exact in single precision
 
 _NAME = re.compile(r"libLLVM(-\d+(\.\d+)*)?\.so(\..+)?")
 _SYSTEM_FOLDERS = ("local/lib", "local/lib64", "lib", "lib64", "lib/*-linux-gnu", "lib/llvm*/lib", "lib64/llvm*/lib")

@@ -50,6 +50,10 @@ from uwlts.storage.data_set import (
     open_shard,
 )
 
+if TYPE_CHECKING:
+    from twin.recording.sensor_simulator import SensorSimulator, SimulatedImage
+    from twin.scene.platforms import Shot
+
 _BRIGHT = 0.03
 """Largest fraction of pixels at the maximum without a warning; a stripe of 20 px with all its pixels there has 2 %."""
 
@@ -213,10 +217,6 @@ def draw_scene(description: DataSetDescription, scene: int, *, attempt: int = 0)
 def _apply_values(sensor: Sensor, values: dict[str, Value], source: str) -> Sensor:
     return validate_description(Sensor, with_values(sensor.model_dump(), values), source) if values else sensor
 
-
-if TYPE_CHECKING:
-    from twin.recording.sensor_simulator import SensorSimulator, SimulatedImage
-    from twin.scene.platforms import Shot
 
 MOST_ATTEMPTS = 20
 """Largest number of draws of a scene until the sensor can measure it; more indicate an error in the description."""

@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from twin.recording.sensor_simulator import SensorSimulator, SimulatedImage
     from twin.scene.platforms import Shot
 
-_WINDOW_PX = 96
-"""Half width of the window around a centre; wider stripes are truncated."""
+_WINDOW_PX = 96  # half width of the window around a centre; wider stripes are truncated
 _LEAST_E = 1e-6
 """Electrons below which a pixel counts as dark, because some processors and threads flush tiny numbers to zero."""
 _LARGEST_HALF = 65504.0

@@ -228,12 +228,9 @@ def describe_turbidity(one: HighlightedDesign) -> str:
 
 # --- refinement -------------------------------------------------------------------------------------------------------
 
-_STEPS = 40
-"""Largest number of iterations."""
-_TOLERANCE = 1e-7
-"""Relative change of the objective that ends the search: far below manufacturing tolerances."""
-_HALVINGS = 12
-"""Largest number of halvings of a step; smaller steps are below manufacturing tolerances."""
+_STEPS = 40  # largest number of iterations
+_TOLERANCE = 1e-7  # relative change of the objective that ends the search: far below manufacturing tolerances
+_HALVINGS = 12  # largest number of halvings of a step; smaller steps are below manufacturing tolerances
 
 Mean = Callable[..., Array]
 Smooth = Callable[[ModuleType, SensorArrays, Field, Mean], Array]

@@ -36,14 +36,10 @@ from uwlts.optics.design import (
     window_thickness_mm,
 )
 
-DEPTHS = 5
-"""Number of evaluated depths, evenly spaced over the part of the measuring volume in the camera's view."""
-PLACES = 7
-"""Number of evaluated points along the stripe at each depth."""
-_MANY = 200
-"""Least number of designs that is worth the time to compile the formulas."""
-_BLOCK = 1000
-"""Number of designs in a block of the compiled formulas."""
+DEPTHS = 5  # number of evaluated depths, evenly spaced over the part of the measuring volume in the camera's view
+PLACES = 7  # number of evaluated points along the stripe at each depth
+_MANY = 200  # least number of designs that is worth the time to compile the formulas
+_BLOCK = 1000  # number of designs in a block of the compiled formulas
 _BRIGHT_LINES = 2.05
 """Level of automatic exposure in standard deviations of speckle above the mean: 2 % of the lines are brighter."""
 _UNMODELLED = 0.02
@@ -52,8 +48,7 @@ RENDERED_SCATTERING_DEPTH = 5.0
 """Largest optical depth of scattering at which formulas and rendering agreed, see docs/results/designs.md."""
 _FLANK = 4.0
 """Limit of the sum over the stripe's profile in standard deviations; less than 1e-4 of the light is outside."""
-_NODES = 16
-"""Number of nodes of the sum on either side."""
+_NODES = 16  # number of nodes of the sum on either side
 _DIFFRACTION = 0.42
 """Standard deviation of the Gaussian closest to an Airy pattern, divided by wavelength times f-number."""
 
@@ -546,8 +541,7 @@ _CLASS_2_W = 1e-3
 _CLASS_3R_W = 5e-3
 _CLASS_3B_W = 0.5
 
-_WATER_KG_PER_M3 = 1030.0
-"""Density of sea water."""
+_WATER_KG_PER_M3 = 1030.0  # density of sea water
 
 
 def laser_class(p: SensorArrays) -> np.ndarray:

@@ -33,8 +33,7 @@ from uwlts.optics.design import (
 
 Follow = Literal["focus", "waist", "volume"]
 
-_DIFFUSE_ROUGHNESS_UM = 5.0
-"""Rms height of a diffuse surface, for the reduction of speckle contrast by the line width."""
+_DIFFUSE_ROUGHNESS_UM = 5.0  # rms height of a diffuse surface, for the reduction of speckle contrast by the line width
 _GRAINS_PX = (0.02, 64.0)
 """Range of tabulated speckle grain sizes for averaging over pixels; other sizes are clipped to it."""
 

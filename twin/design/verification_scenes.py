@@ -117,20 +117,14 @@ _MARGIN = 0.03
 _OVERSIZE = 1.2  # of a plane relative to the stripe, which must not end on it
 _STEP_HEIGHT = 0.2
 """Height of the step relative to the depth range. A high step determines the window's distance more accurately."""
-_EDGE = 0.02
-"""Excluded width beside the step's edge, relative to the line's length."""
+_EDGE = 0.02  # excluded width beside the step's edge, relative to the line's length
 _NEARER = 0.75
 """Factor of the near depth for the target's range: without water and window, the same image rows are nearer."""
-_FARTHER = 1.5
-"""Factor of the far depth for the target's range."""
-_CIRCLE_PX = 24.0
-"""Diameter of the circles in the middle of the range."""
-_SMALLEST_CIRCLE_PX = 12.0
-"""Least diameter of the circles, at the far end of the range."""
-_CIRCLE_BLURS = 2.5
-"""Least diameter of the circles, relative to the diameter of the blur."""
-_DOT = 0.4
-"""Diameter of a marking dot relative to its circle."""
+_FARTHER = 1.5  # factor of the far depth for the target's range
+_CIRCLE_PX = 24.0  # diameter of the circles in the middle of the range
+_SMALLEST_CIRCLE_PX = 12.0  # least diameter of the circles, at the far end of the range
+_CIRCLE_BLURS = 2.5  # least diameter of the circles, relative to the diameter of the blur
+_DOT = 0.4  # diameter of a marking dot relative to its circle
 _LARGEST_BLUR_PX = 12.0
 """Largest diameter of the blur for circle detection, which searches edges within about 6 px on either side."""
 _BORDER_PX = 4.0  # least distance of the target from the image's border

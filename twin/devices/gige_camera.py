@@ -41,8 +41,7 @@ ENCODER_CHUNK = 0x45430001
 TIME_CHUNK = 0x45430002
 _CHUNK_BYTES = 3 * 8
 """Size of the chunks' identifiers and lengths after an image."""
-_ROW_BYTES = 2 * 8
-"""Size of the chunks' data for each row."""
+_ROW_BYTES = 2 * 8  # size of the chunks' data for each row
 
 
 def image_packets(

@@ -17,20 +17,17 @@ from scipy import optimize, special, stats
 from twin.scene.campaign import Take
 from twin.scene.description import Scene
 from twin.scene.forms import PittedPipe, Weld
-from twin.scene.forms.pitted_pipe import pit_depths, pit_places
-from twin.scene.forms.weld import undercut_depths
+from twin.scene.forms.flawed_parts import pit_depths, pit_places, undercut_depths
 from twin.scene.platforms import Motion
 from uwlts.errors import CaptureError
 
 Flaw = Literal["pit", "dent", "undercut"]
 Method = Literal["hit/miss", "signal response"]
 
-FEWEST = {"hit/miss": 60, "signal response": 40}
-"""Fewest flaws of an experiment (MIL-HDBK-1823A, 4.5.2.2)."""
+FEWEST = {"hit/miss": 60, "signal response": 40}  # fewest flaws of an experiment (MIL-HDBK-1823A, 4.5.2.2)
 _DENT_SHARE = 0.1
 """Width of a dent, as a fraction of the pipe's diameter; narrower hollows are pits, as `uwlts inspect` names them."""
-_PLACE_MM = 1.0
-"""Largest distance of a finding from the rim of its pit: errors of calibration and of the deepest place."""
+_PLACE_MM = 1.0  # largest distance of a finding from the rim of its pit: errors of calibration and of the deepest place
 _NINETY = 0.9
 _ONE_SIDED = 0.95
 _SLOPES = (-1.0, 5.0)

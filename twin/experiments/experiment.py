@@ -20,8 +20,7 @@ from uwlts.model.sensor import Sensor
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.figure_table import FigureTable
 
-JOINT = "joint"
-"""Method of an experiment: all recordings of targets and of the step standard are calibrated together."""
+JOINT = "joint"  # method of an experiment: all recordings of targets and of the step standard are calibrated together
 
 
 def experiment(

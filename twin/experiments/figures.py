@@ -183,10 +183,8 @@ def describe_conditions(take: Take) -> str:
     )
 
 
-MEAN = "mean"
-"""Name of the mean over a table's scans."""
-LARGEST_RATIO = 1.5
-"""Means of the experiment should be within this factor of the published ones."""
+MEAN = "mean"  # name of the mean over a table's scans
+LARGEST_RATIO = 1.5  # means of the experiment should be within this factor of the published ones
 
 
 class PublishedFigure(BaseModel, frozen=True):

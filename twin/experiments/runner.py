@@ -23,19 +23,14 @@ from uwlts.runtime.console import INTERRUPTED
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.runtime.workers import Lost, open_workers
 
-AT_ONCE = 2
-"""Number of parallel commands of a stage: only rendering uses all processors by itself."""
-_STEP_IMAGES = 5
-"""Fewer images of a step standard belong to a calibration; a scan has at least this many profiles."""
+AT_ONCE = 2  # number of parallel commands of a stage: only rendering uses all processors by itself
+_STEP_IMAGES = 5  # fewer images of a step standard belong to a calibration; a scan has at least this many profiles
 
-COLOURED = "coloured.ply"
-"""End of the names of clouds with the colours of their deviations."""
+COLOURED = "coloured.ply"  # end of the names of clouds with the colours of their deviations
 
-THESIS = "thesis"
-"""Begin of the name of a file with figures of `uwlts thesis`."""
+THESIS = "thesis"  # begin of the name of a file with figures of `uwlts thesis`
 
-Inspected = Literal["flange", "pipe", "weld"]
-"""Kind of object for `uwlts inspect`; a plane is the face of a flange."""
+Inspected = Literal["flange", "pipe", "weld"]  # kind of object for `uwlts inspect`; a plane is the face of a flange
 
 
 @dataclass(frozen=True)

@@ -30,14 +30,10 @@ from uwlts.errors import DesignError
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Camera, Medium, Sensor, Window
 
-_NEWTON_STEPS = 6
-"""Steps after which the inverse distortion of real lenses is exact in single precision."""
-_FIELD = 0.96
-"""The blur is measured at the image centre and at this fraction of the distance to its edges and corners."""
-_RIM_POINTS = 8
-"""Number of rays through the pupil's rim, enough for a stable largest blur radius."""
-_DEPTHS = 200
-"""Number of depths in the blur table, spaced logarithmically from 1 mm to 10 m behind the window."""
+_NEWTON_STEPS = 6  # steps after which the inverse distortion of real lenses is exact in single precision
+_FIELD = 0.96  # the blur is measured at the image centre and at this fraction of the distance to its edges and corners
+_RIM_POINTS = 8  # number of rays through the pupil's rim, enough for a stable largest blur radius
+_DEPTHS = 200  # number of depths in the blur table, spaced logarithmically from 1 mm to 10 m behind the window
 
 
 class LensRays:

@@ -11,12 +11,9 @@ from functools import cache
 import cv2
 import numpy as np
 
-NODE_SPACING_PX = 2
-"""Spacing of the rays of the coarse grid, and side length of its cells."""
-LIT_SIGMAS = 4.5
-"""The stripe is rendered up to this many standard deviations of the sheet, to 4e-5 of its peak."""
-_LARGEST_DISC = 24
-"""Up to this radius in cells, dilation by a disc is faster than a distance transform."""
+NODE_SPACING_PX = 2  # spacing of the rays of the coarse grid, and side length of its cells
+LIT_SIGMAS = 4.5  # the stripe is rendered up to this many standard deviations of the sheet, to 4e-5 of its peak
+_LARGEST_DISC = 24  # up to this radius in cells, dilation by a disc is faster than a distance transform
 _CANDIDATES = 64
 """Number of generators tried for each further axis; more candidates improve the lattice by a few percent only."""
 

@@ -22,10 +22,8 @@ from twin.light.image_sampling import NODE_SPACING_PX, combine_corners, find_mar
 from twin.light.smoothing import FoundLight, blur_cells, estimate_light, interpolate_cells
 from twin.light.walk import Walker
 
-WALK_CELL_PX = 8
-"""Side length of the cells for multiply scattered light away from the stripe."""
-WALKS_AT_ONCE = 2**21
-"""Largest number of random walks traced together; this many take about 200 MB."""
+WALK_CELL_PX = 8  # side length of the cells for multiply scattered light away from the stripe
+WALKS_AT_ONCE = 2**21  # largest number of random walks traced together; this many take about 200 MB
 SPREAD_MM = (0.3, 1.2, 5.0, 20.0, 80.0)
 """Decay lengths, to 1 / e, of light that the water scatters from the sheet onto surfaces."""
 TOLERANCE = 2.5e-4
@@ -36,10 +34,8 @@ NOISE_SHARES = (0.05, 0.2)
 _NARROWEST_CELLS = 0.7
 """Standard deviation in cells of the least blurred images of stripe and haze; each further one is three times as wide.
 """
-_WALKS_BESIDE_STRIPE = 8
-"""Factor on the number of walks beside the stripe, where the light is bright and steep."""
-_CELLS_BESIDE_STRIPE = 2
-"""Width in cells of the border of the stripe that takes more walks."""
+_WALKS_BESIDE_STRIPE = 8  # factor on the number of walks beside the stripe, where the light is bright and steep
+_CELLS_BESIDE_STRIPE = 2  # width in cells of the border of the stripe that takes more walks
 _WALKS_IN_STRIPE = 4
 """Factor on the number of walks in the small cells of the stripe; 1 if neighbouring cells determine the light there."""
 

@@ -27,25 +27,18 @@ from twin.scene.objects import Objects
 
 Body = Literal["particles", "bubbles"]
 
-_LEAST_MM = 0.1
-"""Smallest diameter of bodies rendered individually; smaller ones are part of the water's turbidity."""
-_MOST_MM = 5.0
-"""Largest diameter: with N(> d) ~ d^-3, one body in 125,000 is larger."""
+_LEAST_MM = 0.1  # smallest diameter of bodies rendered individually; smaller ones are part of the water's turbidity
+_MOST_MM = 5.0  # largest diameter: with N(> d) ~ d^-3, one body in 125,000 is larger
 _SLOPE = 3.0
 """Exponent of the size distribution N(> d) ~ d^-3: equal volume in equal logarithmic intervals.
 
 Bader, J. Geophys. Res. 75, 2822, 1970; Sheldon et al., Limnol. Oceanogr. 17, 327, 1972.
 """
-_REFLECTANCE = 0.3
-"""Diffuse reflectance of particles (assumed): aggregates are grey to brownish white."""
-_SIGMAS = 3.0
-"""Bodies farther from the sheet's centre than this many standard deviations are treated as dark."""
-_MOST_BODIES = 50_000
-"""Largest number of bodies in one image; more of them would look like haze."""
-_STEP_PX = 0.5
-"""Largest distance of the discs that form a track; a disc is at least a pixel wide."""
-_MOST_STEPS = 400
-"""Largest number of discs of a track."""
+_REFLECTANCE = 0.3  # diffuse reflectance of particles (assumed): aggregates are grey to brownish white
+_SIGMAS = 3.0  # bodies farther from the sheet's centre than this many standard deviations are treated as dark
+_MOST_BODIES = 50_000  # largest number of bodies in one image; more of them would look like haze
+_STEP_PX = 0.5  # largest distance of the discs that form a track; a disc is at least a pixel wide
+_MOST_STEPS = 400  # largest number of discs of a track
 _MARGIN_PX = 20.0
 """Width of the border around the image whose bodies are included, because their discs may reach into it."""
 

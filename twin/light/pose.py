@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from twin.backend.arrays import Float, Point3f, Vector3f, opaque, opaque_point, opaque_transform
 
-CLEAR_MM = 1e-2
-"""Offset of rays from the surface they start on, which prevents an intersection with it."""
+CLEAR_MM = 1e-2  # offset of rays from the surface they start on, which prevents an intersection with it
 
 
 @dataclass(frozen=True)

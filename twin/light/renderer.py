@@ -24,8 +24,16 @@ import numpy as np
 
 from twin.backend.arrays import Float, Point3f, UInt32, Vector4f, begin_kernels, opaque, to_jit
 from twin.light.camera import CameraView, RaySegment, trace_segments
-from twin.light.caustics import CELLS, PATCH_MM, Caustics
-from twin.light.illumination import Light, SheetCrossing, compute_haze, intersect_sheet, make_lights
+from twin.light.illumination import (
+    CELLS,
+    PATCH_MM,
+    Caustics,
+    Light,
+    SheetCrossing,
+    compute_haze,
+    intersect_sheet,
+    make_lights,
+)
 from twin.light.image_sampling import (
     NODE_SPACING_PX,
     combine_corners,
@@ -49,32 +57,22 @@ from twin.scene.platforms import Light as LightName
 from uwlts.model.placement import camera_from_object, check_design
 from uwlts.model.sensor import Medium, Sensor
 
-SAMPLES_AT_ONCE = 2**23
-"""Largest number of samples rendered together; this many take about 100 MB."""
+SAMPLES_AT_ONCE = 2**23  # largest number of samples rendered together; this many take about 100 MB
 CHANGE_SHARE = 2e-3
 """In lamp images, pixels are sampled finely if their corners differ by more than this fraction of the maximum."""
 BEND_SHARE = 1e-3
 """In a wide stripe, pixels are sampled finely if second differences exceed this fraction of the maximum."""
-_FEWER_SAMPLES = 4
-"""Divisor of the number of samples in other pixels of a wide stripe."""
-_LEAST_SPP = 4
-"""Smallest number of samples there: one for each quarter of the pupil."""
-_WIDE_PX = 64
-"""Mean width of a stripe in px below which all pixels are sampled finely: most would need it."""
-_MIRRORS = 2
-"""Largest number of successive mirror reflections of a camera ray."""
-_WALKS_PER_SAMPLE = 0.15
-"""Random walks per cell and sample of a lit pixel in clear water; turbid water takes more."""
-_SPOT_ASIDE = 0.25
-"""Offset of an uneven lamp's axis from the camera's axis, as a fraction of the view's corner slope."""
-_DRIFTING_STREAM = 7
-"""Random number stream of particles and bubbles, separate from those of walks and noise."""
-_TRAVEL_STEP_MM = 0.2
-"""While the sensor moves, lit pixels are located at positions of this spacing."""
+_FEWER_SAMPLES = 4  # divisor of the number of samples in other pixels of a wide stripe
+_LEAST_SPP = 4  # smallest number of samples there: one for each quarter of the pupil
+_WIDE_PX = 64  # mean width of a stripe in px below which all pixels are sampled finely: most would need it
+_MIRRORS = 2  # largest number of successive mirror reflections of a camera ray
+_WALKS_PER_SAMPLE = 0.15  # random walks per cell and sample of a lit pixel in clear water; turbid water takes more
+_SPOT_ASIDE = 0.25  # offset of an uneven lamp's axis from the camera's axis, as a fraction of the view's corner slope
+_DRIFTING_STREAM = 7  # random number stream of particles and bubbles, separate from those of walks and noise
+_TRAVEL_STEP_MM = 0.2  # while the sensor moves, lit pixels are located at positions of this spacing
 _STRIPE_SUMS, _LINE_SUMS = 3, 3
 """Numbers of means of the stripe, and of the lines' light."""
-_REACH_SHARE = 1.5
-"""Largest distance of visible surfaces from the OCS's origin, divided by the stand-off (approximate)."""
+_REACH_SHARE = 1.5  # largest distance of visible surfaces from the OCS's origin, divided by the stand-off (approximate)
 
 
 class _Nodes(NamedTuple):

@@ -34,22 +34,14 @@ from uwlts.errors import DesignError
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Laser, Medium, Sensor
 
-_RAYS = 1025
-"""Number of fan rays traced through the window, many more than the terms of the series."""
-_NODES = 4097
-"""Number of nodes of the power along the fan, more than the traced rays."""
-_NEWTON_STEPS = 2
-"""Enough for single precision: the start is the ray of a fan with one vertex behind the window."""
-_LARGEST_DEGREE = 27
-"""Degree of the series before truncation, sufficient for fans that fill their window."""
-_LARGEST_MISS_MM = 1e-3
-"""Largest distance between the series and a traced ray 1 m behind the window."""
-_SERIES_MM = 5e-5
-"""Largest sum of the truncated terms of a series in mm, about the rounding errors of the traced rays."""
-_SERIES_SLOPE = 1e-7
-"""Largest sum of the truncated terms of a series of slopes."""
-_SMALLEST_SPREAD_MM = 1e-3
-"""Smallest distance from the fan's vertex; rays closer to it are treated as at this distance."""
+_RAYS = 1025  # number of fan rays traced through the window, many more than the terms of the series
+_NODES = 4097  # number of nodes of the power along the fan, more than the traced rays
+_NEWTON_STEPS = 2  # enough for single precision: the start is the ray of a fan with one vertex behind the window
+_LARGEST_DEGREE = 27  # degree of the series before truncation, sufficient for fans that fill their window
+_LARGEST_MISS_MM = 1e-3  # largest distance between the series and a traced ray 1 m behind the window
+_SERIES_MM = 5e-5  # largest sum of the truncated terms of a series in mm, about the rounding errors of the traced rays
+_SERIES_SLOPE = 1e-7  # largest sum of the truncated terms of a series of slopes
+_SMALLEST_SPREAD_MM = 1e-3  # smallest distance from the fan's vertex; rays closer to it are treated as at this distance
 
 
 Part = tuple[Float, Float, Float]

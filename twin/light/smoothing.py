@@ -25,22 +25,14 @@ from scipy.ndimage import map_coordinates
 
 from uwlts.runtime.compiled import compiled
 
-_AT_ONCE = 2**22
-"""Number of samples kept before they are sorted; they take about 50 MB."""
-_CLASS_BITS = 2
-"""Light varies within a class of walks by a factor of 2 to this power."""
-_FAINT_SHARE = 0.05
-"""Walks that change their cell by less than this fraction of the tolerance are put into one class."""
-_CLASSES_ADD = 4
-"""Number of classes, each at its tolerance, whose noise is assumed to add in one place."""
-_NO_WEIGHT = 1e-25
-"""Light in W/mm2 below which a feature is dropped."""
-_PORTION = 1.0
-"""Largest contribution of one walk in one place, in units of the tolerance."""
-_WIDTHS = (0.7, 1.4, 2.8, 5.6)
-"""Standard deviations in cells of the local corrections."""
-_STEPS = 40
-"""Number of expectation-maximisation steps; further ones change the light by less than its noise."""
+_AT_ONCE = 2**22  # number of samples kept before they are sorted; they take about 50 MB
+_CLASS_BITS = 2  # light varies within a class of walks by a factor of 2 to this power
+_FAINT_SHARE = 0.05  # walks that change their cell by less than this fraction of the tolerance are put into one class
+_CLASSES_ADD = 4  # number of classes, each at its tolerance, whose noise is assumed to add in one place
+_NO_WEIGHT = 1e-25  # light in W/mm2 below which a feature is dropped
+_PORTION = 1.0  # largest contribution of one walk in one place, in units of the tolerance
+_WIDTHS = (0.7, 1.4, 2.8, 5.6)  # standard deviations in cells of the local corrections
+_STEPS = 40  # number of expectation-maximisation steps; further ones change the light by less than its noise
 _TINY = np.finfo(np.float32).tiny
 
 

@@ -40,14 +40,10 @@ _STEPS = 64
 """Largest number of segments of a walk; even in the most turbid waters fewer than one walk in 10^4 would be longer."""
 _FEW = 2**16
 """Up to this number of walks, all segments are traced in one kernel, which is faster than one launch per segment."""
-_TOWARDS_LASER = 0.15
-"""Fraction of directions sampled about the direction to the laser."""
-_TOWARDS_SHEET = 0.3
-"""Fraction of directions sampled from the lobe of the nearby sheet."""
-_NEAR_SHEET = 0.5
-"""Fraction of scattering distances sampled about the position nearest to the sheet."""
-_SURVIVES_FROM = 0.25
-"""Walks with less than this fraction of their initial strength undergo Russian roulette."""
+_TOWARDS_LASER = 0.15  # fraction of directions sampled about the direction to the laser
+_TOWARDS_SHEET = 0.3  # fraction of directions sampled from the lobe of the nearby sheet
+_NEAR_SHEET = 0.5  # fraction of scattering distances sampled about the position nearest to the sheet
+_SURVIVES_FROM = 0.25  # walks with less than this fraction of their initial strength undergo Russian roulette
 
 
 @dataclass

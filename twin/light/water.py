@@ -20,8 +20,7 @@ from uwlts.model.phase_functions import Molecular, PhaseFunction, Scatterer
 from uwlts.model.sensor import Medium
 
 NODES = 4096  # of a table, 0.4 % apart in angle below 90 deg
-FORWARD_END = 1e-10
-"""Below this 1 - cos (1.4e-5 rad) the tables are constant, at a height that preserves the integral."""
+FORWARD_END = 1e-10  # below this 1 - cos (1.4e-5 rad) the tables are constant, at a height that preserves the integral
 BACKWARD_END = 2.0**-17
 """Below this 1 + cos (0.22 deg) the tables are constant and continuous, about the resolution of single precision at 2.
 """

@@ -19,8 +19,7 @@ _POINT_STEPS = 6
 """Number of iterations: refraction at the window is weak, so each Newton step reduces the error to a hundredth."""
 _POINT_MM = 0.05
 """A point is visible if its ray ends on a surface at this distance from it, far above single-precision rounding."""
-_POINT_PX = 1e-2
-"""A point is found if the last Newton step was smaller."""
+_POINT_PX = 1e-2  # a point is found if the last Newton step was smaller
 _TOLERANCE_MM = 5e-4
 """Largest distance of a root from the sheet's centre; across a depth edge, the distance has a jump instead of a root.
 """

@@ -6,8 +6,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from twin.light.caustics import Caustics
-from twin.light.illumination import reflect_ring
+from twin.light.illumination import Caustics, reflect_ring
 from twin.light.pose import Travel
 from twin.light.renderer import LaserFrame, Renderer
 from twin.recording.frame_truth import (
@@ -48,10 +47,8 @@ PROBE_SPP = 4
 """Samples per lit pixel of the images that determine the exposure, where an error of some percent is acceptable."""
 BRIGHT_SHARE = 0.98
 """Quantile of the brightest pixel per profile line that automatic exposure uses; 2 % of the lines may be brighter."""
-STRAY_LINES = 4
-"""Number of brightest lines that may be due to single bright pixels."""
-LIT_SHARE = 0.05
-"""A line is lit if it exceeds this fraction of the brightest line that is not one of `STRAY_LINES`."""
+STRAY_LINES = 4  # number of brightest lines that may be due to single bright pixels
+LIT_SHARE = 0.05  # a line is lit if it exceeds this fraction of the brightest line that is not one of `STRAY_LINES`
 
 
 def with_window(sensor: Sensor, *, mounted: bool) -> Sensor:

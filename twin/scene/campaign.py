@@ -302,10 +302,8 @@ def _tilt_direction(direction: np.ndarray, angles_deg: np.ndarray) -> tuple[floa
 # --- comparison with the sensor's stated uncertainties ----------------------------------------------------------------
 
 
-_NORMAL = 1.96
-"""Half width that contains 95 % of normal deviations (unit: standard deviation)."""
-_UNIFORM = 0.95
-"""The same for uniform deviations (unit: half width of their distribution)."""
+_NORMAL = 1.96  # half width that contains 95 % of normal deviations (unit: standard deviation)
+_UNIFORM = 0.95  # the same for uniform deviations (unit: half width of their distribution)
 _DIFFERENCE = 2.0 * (1.0 - math.sqrt(0.05))
 """The same for the difference of two independent uniform deviations, whose distribution is a triangle."""
 

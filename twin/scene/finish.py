@@ -38,14 +38,11 @@ _LUMINANCE = np.array([0.0722, 0.7152, 0.2126], np.float32)
 _SHIFT = "point_shift_mm"
 _CELLS_PER_PATCH = 9
 """Number of grid cells per patch: enough that no cell overlaps two circles of a target."""
-_PATCH_VALUES = 8
-"""Columns of the table of patches; the last two are padding, as values are read in groups of four."""
+_PATCH_VALUES = 8  # columns of the table of patches; the last two are padding, as values are read in groups of four
 _WAVES_AT_ONCE = 4
 """Number of waves read together, which takes a third less time than one by one; more are not read faster."""
-_ROUNDING_MM = 1e-3
-"""Bound of the single-precision rounding error of positions on a plate of 1 m."""
-COAT_INDEX = {"painted": 1.50, "pvc": 1.54}
-"""Refractive indices in air of an alkyd or acrylic binder, and of rigid PVC."""
+_ROUNDING_MM = 1e-3  # bound of the single-precision rounding error of positions on a plate of 1 m
+COAT_INDEX = {"painted": 1.50, "pvc": 1.54}  # refractive indices in air of an alkyd or acrylic binder, and of rigid PVC
 
 # Wavelength in nm, n and k of iron at room temperature: Johnson and Christy 1974, Phys. Rev. B 9:5056.
 _IRON = np.array(

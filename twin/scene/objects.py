@@ -21,8 +21,7 @@ from twin.scene.surfaces import GAUSSIANS
 from uwlts.errors import DescriptionError
 from uwlts.files.reading import require_regular_file
 
-_MOST_MESH_BYTES = 2**28
-"""Size of a binary STL file with five million triangles."""
+_MOST_MESH_BYTES = 2**28  # size of a binary STL file with five million triangles
 _FACING_SENSOR = np.diag([1.0, -1.0, -1.0, 1.0])
 _BLOCK_FACES = [np.roll(np.eye(3), shift, axis=1) @ np.diag([1, sign, sign]) for shift in range(3) for sign in (1, -1)]
 """Right-handed axes (3, 3) of a block's faces; the third one is the outward normal."""

@@ -1,7 +1,8 @@
 """Platforms by kind: underwater vehicle, linear guide, rotary table, and robot arm, with the errors of their motion.
 
 Formulas of the vehicle follow T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control (Wiley, 2011;
-"Fossen"), and J. A. Farrell, Aided Navigation (McGraw-Hill, 2008; "Farrell")."""
+"Fossen"), and J. A. Farrell, Aided Navigation (McGraw-Hill, 2008; "Farrell").
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -27,10 +28,9 @@ from twin.scene.scene_object import Pose
 from uwlts.errors import DescriptionError
 from uwlts.model.sensor import Description, NotNegative, Positive, Vector
 
-GRAVITY_M_S2 = 9.81
+GRAVITY_M_S2 = 9.81  # standard gravity (9.80665), rounded
 _COMPONENTS = 24  # sines of a sea state; it does not repeat during a scan
-_STEP_S = 0.05
-"""Time step of the navigation errors, far below all their time constants."""
+_STEP_S = 0.05  # time step of the navigation errors, far below all their time constants
 
 
 class Sea(Description):
@@ -351,12 +351,10 @@ def _bend(size: float, rng: np.random.Generator) -> Callable[[np.ndarray], np.nd
 # --- robot arm --------------------------------------------------------------------------------------------------------
 
 
-_ARC_S = 0.05
-"""Time step of the joint trajectory along a path."""
+_ARC_S = 0.05  # time step of the joint trajectory along a path
 _STARTS = 40
 """Number of random starts of the search for joint angles: up to 8 postures reach a pose, and some starts find none."""
-_REACHED = 1e-6
-"""Largest residual of a reached pose, relative to the arm's length, and in rad."""
+_REACHED = 1e-6  # largest residual of a reached pose, relative to the arm's length, and in rad
 
 
 class Robot(Route):

@@ -102,13 +102,10 @@ class Shot:
     time_s: float | None = None
 
 
-Poses = Callable[[np.ndarray], np.ndarray]
-"""Poses (N, 4, 4) at times (N,) in s."""
-LEAD_S = 1.0
-"""A platform moves for this time before the first and after the last image; clock offsets must be smaller."""
+Poses = Callable[[np.ndarray], np.ndarray]  # poses (N, 4, 4) at times (N,) in s
+LEAD_S = 1.0  # a platform moves for this time before the first and after the last image; clock offsets must be smaller
 
-SPOT_MM = 1e-9
-"""Positions closer together are identical: above the rounding error of coordinates of some metres."""
+SPOT_MM = 1e-9  # positions closer together are identical: above the rounding error of coordinates of some metres
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,13 +34,11 @@ Finish = Literal[
 ]
 Lengths = tuple[float, float, float]
 
-WAVES = 64
-"""Number of plane waves of a field: its autocorrelation over one object deviates from the mean by about 0.1."""
+WAVES = 64  # number of plane waves of a field: its autocorrelation over one object deviates from the mean by about 0.1
 _FINEST = 10 * math.pi
 """Largest wave number times the correlation length: a wavelength of a fifth of that length. The omitted tail of the
 spectrum has 4 % of the variance; pixels that are to resolve less would show it as noise of their samples."""
-LARGEST_CLIPPED = 0.01
-"""Largest relative loss of mean reflectance by the limit of 1."""
+LARGEST_CLIPPED = 0.01  # largest relative loss of mean reflectance by the limit of 1
 
 
 @dataclass(frozen=True)
@@ -158,8 +156,7 @@ GAUSSIANS = 8
 """Number of Gaussians, with standard deviations in steps of about 1.6: their sum is the profile to 2 % of its peak."""
 _TAILS = (0.08, 0.999)
 """Fractions of the light between which the Gaussians are spaced; the first and the last take over the rest."""
-_DEPTHS = 32
-"""Number of depths of the first scattering (Gauss-Laguerre quadrature)."""
+_DEPTHS = 32  # number of depths of the first scattering (Gauss-Laguerre quadrature)
 
 
 @dataclass(frozen=True)

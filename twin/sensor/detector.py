@@ -28,18 +28,14 @@ from uwlts.model.sensor import Camera, Detector, Sensor
 from uwlts.runtime.compiled import compiled
 from uwlts.runtime.workers import count_processors
 
-PLANCK_TIMES_LIGHT = 6.62607015e-34 * 299792458.0
-"""h c in J m (SI, exact)."""
+PLANCK_TIMES_LIGHT = 6.62607015e-34 * 299792458.0  # h c in J m (SI, exact)
 
-MOST_ELECTRONS = 1e15
-"""Upper limit, far above any real pixel; larger Poisson numbers would not fit into 64 bits."""
+MOST_ELECTRONS = 1e15  # upper limit, far above any real pixel; larger Poisson numbers would not fit into 64 bits
 
-_BANDS = 8
-"""Number of bands of rows with independent random numbers, and of parallel tasks."""
+_BANDS = 8  # number of bands of rows with independent random numbers, and of parallel tasks
 _PARALLEL_PX = 2**19
 """Number of pixels from which bands are computed in parallel; below, threads cost more time than they save."""
-_STREAM = 1288
-"""Random number stream of the pattern, separate from those of the images."""
+_STREAM = 1288  # random number stream of the pattern, separate from those of the images
 
 
 def electrons_per_ms(irradiance: np.ndarray, camera: Camera, detector: Detector, *, wavelength_nm: float) -> np.ndarray:
@@ -240,14 +236,10 @@ def _sweep(charge: np.ndarray, full_well_e: float, share: float) -> np.ndarray:
 # --- 3D cameras -------------------------------------------------------------------------------------------------------
 
 
-INVALID = 0
-"""Number of a line without a stripe."""
-THRESHOLD = 0.06
-"""Fraction of the full scale above which pixels count: above the noise, as usual for such cameras."""
-_FEWEST_PX = 2
-"""Smallest width of a stripe; narrower peaks are hot pixels."""
-_REACH_PX = 64
-"""Largest distance of a stripe's edge from its brightest pixel."""
+INVALID = 0  # number of a line without a stripe
+THRESHOLD = 0.06  # fraction of the full scale above which pixels count: above the noise, as usual for such cameras
+_FEWEST_PX = 2  # smallest width of a stripe; narrower peaks are hot pixels
+_REACH_PX = 64  # largest distance of a stripe's edge from its brightest pixel
 
 
 @dataclass(frozen=True)
@@ -295,18 +287,15 @@ GLARE_REACH = 0.15
 _SPOT_MM = 0.2, 3.0
 """Range of the diameters of spots on the window, from silt and fouling films to drops and fingerprints."""
 _CELLS_PER_SPOT = 4  # so that a round spot stays round
-_DIRT_STREAM = 41
-"""Random number stream of the spots, separate from others of the same seed."""
-_CELLS_PER_REACH = 16
-"""Number of cells per decay length; the smooth veiling glare is then accurate to about 1e-3."""
+_DIRT_STREAM = 41  # random number stream of the spots, separate from others of the same seed
+_CELLS_PER_REACH = 16  # number of cells per decay length; the smooth veiling glare is then accurate to about 1e-3
 LASER_SHARES = {"red": 1.0, "green": 0.083, "blue": 0.008}
 """Response to laser light at 635 nm behind colour filters, relative to red.
 
 0.041 and 0.004 divided by 0.496 for the Nikon D5100 (Darrodi et al. 2015, J. Opt. Soc. Am. A 32, 381). Filters of
 machine vision cameras may separate colours less.
 """
-_PEDESTAL = 0.0, 30.0
-"""Offset and radius of stray light in radii of the sheet (the radius is assumed)."""
+_PEDESTAL = 0.0, 30.0  # offset and radius of stray light in radii of the sheet (the radius is assumed)
 _FIRST_LOBES = (-2.0, 0.4), (2.0, 0.4)
 """Offsets and radii of the first side lobes in radii of the sheet.
 

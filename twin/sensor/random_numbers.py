@@ -15,23 +15,18 @@ from uwlts.runtime.compiled import compiled, compiled_part
 
 POISSON_STEP = 0.125
 """Step of the means tabulated by `poisson_numbers`; smaller steps need a larger table and fewer events."""
-LARGEST_MEAN = 32.0
-"""NumPy generates numbers with means from here on."""
+LARGEST_MEAN = 32.0  # NumPy generates numbers with means from here on
 _LEVELS = int(LARGEST_MEAN / POISSON_STEP)
 _CELLS = 4096
 """Cells of the unit interval in a table; twelve bits of a random number select one."""
-_COUNTS = 120
-"""Number of tabulated counts: those with a probability above 1e-17 for some mean in the table."""
-_SEVERAL = 255
-"""Marks a cell that belongs to several counts."""
+_COUNTS = 120  # number of tabulated counts: those with a probability above 1e-17 for some mean in the table
+_SEVERAL = 255  # marks a cell that belongs to several counts
 
 _LAYERS = 256  # of the ziggurat, with the edge and area below (Marsaglia and Tsang 2000)
 _LAST_EDGE = 3.6541528853610088
 """Start of the tail, the outer edge of the last layer under exp(-x^2 / 2) (Marsaglia and Tsang 2000)."""
-_LAYER_AREA = 4.92867323399e-3
-"""Area of each layer."""
-_MANTISSA = 2**24
-"""Number of positions within a layer, the resolution of single precision."""
+_LAYER_AREA = 4.92867323399e-3  # area of each layer
+_MANTISSA = 2**24  # number of positions within a layer, the resolution of single precision
 
 
 def poisson_numbers(mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:

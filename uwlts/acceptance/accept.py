@@ -39,14 +39,10 @@ from uwlts.storage.cloud_files import is_cloud, load_cloud
 
 _PROBED, _SPACED, _FLAT = 10, 7, 6
 """Least numbers of measured spheres, spacings and planes."""
-_DIAMETERS = (0.02, 0.2)
-"""Smallest and largest diameter of a sphere (unit: diagonal of the volume)."""
-_SPACING = 0.3
-"""Least spacing of two spheres (unit: diagonal of the volume)."""
-_PLANE = 0.5
-"""Least length of a plane (unit: diagonal of the volume)."""
-_WIDTH_MM = 50.0
-"""Least width of a plane."""
+_DIAMETERS = (0.02, 0.2)  # smallest and largest diameter of a sphere (unit: diagonal of the volume)
+_SPACING = 0.3  # least spacing of two spheres (unit: diagonal of the volume)
+_PLANE = 0.5  # least length of a plane (unit: diagonal of the volume)
+_WIDTH_MM = 50.0  # least width of a plane
 _APART = 0.05
 """Distance (unit: diagonal of the volume) from which positions differ: a sixth of the least spacing of two spheres."""
 _TURNED_DEG = 10.0

@@ -25,8 +25,7 @@ from uwlts.model.trajectory import Trajectory
 
 _LEAST_DRIFT = np.repeat([1e-3, 1e-7], 3)
 """Lower bound of the drift at the end, mm and rad; no navigation is more accurate."""
-_START = 1e-7
-"""Variance relative to that at the end, below which it counts as zero: 0.1 mm of 0.3 m."""
+_START = 1e-7  # variance relative to that at the end, below which it counts as zero: 0.1 mm of 0.3 m
 _AS_DEAD_RECKONED = 0.5
 """Least ratio of the position-heading covariance to that of dead reckoning, for positions to count as dead-reckoned."""
 _WALKS = (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
@@ -164,8 +163,7 @@ def _is_dead_reckoned(trajectory: Trajectory) -> bool:
     return bool(np.sum(stated * expected) > _AS_DEAD_RECKONED * np.sum(expected**2))
 
 
-_EXACT = 1e-10
-"""Variance at the start of the path, relative to that at its end; the start defines the frame."""
+_EXACT = 1e-10  # variance at the start of the path, relative to that at its end; the start defines the frame
 
 _multiply_by_triangle: Any = get_blas_funcs("trmm", dtype=np.float64)
 

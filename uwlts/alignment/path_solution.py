@@ -28,8 +28,7 @@ from uwlts.fitting.patches import (
     slope_information,
 )
 
-Pair = tuple[int, int]
-"""Numbers of two pieces that show the same surface, in chronological order."""
+Pair = tuple[int, int]  # numbers of two pieces that show the same surface, in chronological order
 
 
 @dataclass(frozen=True, eq=False)

@@ -79,12 +79,10 @@ class AlignmentOptions:
         return float(chi2.ppf(chi2.cdf(self.search_sigmas**2, 1), 6))
 
 
-_FEWEST_POINTS = 200
-"""Least number of points of a piece with patches."""
+_FEWEST_POINTS = 200  # least number of points of a piece with patches
 _ACROSS = 1e-6
 """Ridge relative to the extent of a patch's neighbours, which sets the time gradient along the normal to zero."""
-_ALONE_MM2 = 1e-9
-"""Ridge of a patch without neighbours, which sets its time gradient to zero."""
+_ALONE_MM2 = 1e-9  # ridge of a patch without neighbours, which sets its time gradient to zero
 
 
 @dataclass(frozen=True, eq=False)

@@ -225,8 +225,7 @@ def _laser_images(capture: Capture, most: int) -> Iterator[np.ndarray]:
         yield capture.image(int(lit[place]))
 
 
-_Seen = tuple[int, np.ndarray | Stripe]
-"""Number of a laser frame, and its image or the stripe from a 3D camera."""
+_Seen = tuple[int, np.ndarray | Stripe]  # number of a laser frame, and its image or the stripe from a 3D camera
 
 
 def _laser_frames(capture: Capture) -> Iterator[_Seen]:

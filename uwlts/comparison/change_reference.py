@@ -26,10 +26,8 @@ from uwlts.storage.number_tables import MM_PER_UNIT, Unit, check_unit
 
 _OPPOSITE = -0.5
 """Largest cosine between the normals of opposite sides: 120 deg, beyond the angle of two faces at an edge."""
-_SMOOTH = 0.7
-"""Least absolute cosine between normals of one face: orientation is not carried across an edge of 90 deg."""
-_NEARER = 0.25
-"""Ratio of the distances to both sides below which a place clearly belongs to the nearer one."""
+_SMOOTH = 0.7  # least absolute cosine between normals of one face: orientation is not carried across an edge of 90 deg
+_NEARER = 0.25  # ratio of the distances to both sides below which a place clearly belongs to the nearer one
 _BOTH = 0.25
 """Fraction of the places on the other side from which the scan contains both sides. Wear nearly as deep
 as the part is thick must cover more than this fraction of a face to be mistaken for its other side."""
@@ -124,10 +122,8 @@ def _orient_places(places: np.ndarray, normals: np.ndarray, apart_mm: float) -> 
 # --- sides of a mesh --------------------------------------------------------------------------------------------------
 
 
-_SAMPLES_PER_DISC = 60
-"""Samples of a mesh in a disc: twice the points of a cloud, so that the cloud's noise dominates."""
-_MOST_SAMPLES = 3_000_000
-"""Limit of memory for samples of a mesh."""
+_SAMPLES_PER_DISC = 60  # samples of a mesh in a disc: twice the points of a cloud, so that the cloud's noise dominates
+_MOST_SAMPLES = 3_000_000  # limit of memory for samples of a mesh
 _AT_A_TIME = 20_000  # places, to limit memory
 
 Reference = PointCloud | IdealShape | str | os.PathLike[str]

@@ -20,11 +20,9 @@ from uwlts.shapes.flat import Plane
 from uwlts.shapes.sphere import Sphere
 from uwlts.storage.cloud import PointUncertainty
 
-_MOST_FITTED = 50_000
-"""Number of points above which a cloud is thinned for a fit; more take longer without a benefit."""
+_MOST_FITTED = 50_000  # number of points above which a cloud is thinned for a fit; more take longer without a benefit
 
-_MISFIT_STD = 5.0
-"""Distance of a place from a fitted shape, in standard deviations, beyond which it departs from it."""
+_MISFIT_STD = 5.0  # distance of a place from a fitted shape, in standard deviations, beyond which it departs from it
 _MISFIT_SIZE = 0.002
 """Least such distance, divided by the radius, or by half the extent of a plane: out of roundness of usual parts."""
 _MISFIT_SHARE = 0.4

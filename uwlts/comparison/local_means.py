@@ -39,10 +39,8 @@ class ComparisonOptions:
 OPTIONS = ComparisonOptions()
 
 
-TWO_SIDED = 1.96
-"""Standard normal quantile of 97.5 %."""
-_NEARLY_NORMAL = 200
-"""Least number of points with Student's quantile within 1 % of the normal one."""
+TWO_SIDED = 1.96  # standard normal quantile of 97.5 %
+_NEARLY_NORMAL = 200  # least number of points with Student's quantile within 1 % of the normal one
 _PAIRS_AT_A_TIME = 2_000_000  # to limit memory
 
 

@@ -25,23 +25,16 @@ from uwlts.storage.cloud_files import load_cloud
 from uwlts.storage.mesh_file import SurfaceMesh
 from uwlts.storage.number_tables import Unit
 
-_BLOCK = 48
-"""Cubes along the edge of a block that marching cubes processes at once."""
+_BLOCK = 48  # cubes along the edge of a block that marching cubes processes at once
 _PLACES_AT_A_TIME = 500_000  # to limit memory
-_FEWEST = 50
-"""Least number of points of a scan."""
-_CUBES_OF_RADIUS = 3.0
-"""Cubes per patch radius."""
+_FEWEST = 50  # least number of points of a scan
+_CUBES_OF_RADIUS = 3.0  # cubes per patch radius
 _CUBES_OF_WALL = 1.5
 """Cubes per thickness of the thinnest wall. Without noise, walls up to 48 deg from the cube edges hold a corner."""
-_WALLS_ASKED = 4000
-"""Number of points at which the wall thickness is measured."""
-_OPPOSITE = 0.7
-"""Cosine of the largest angle (45 deg) between the normals of two opposite sides, one of them reversed."""
-_FARTHEST_CUBES = 0.75
-"""Largest distance of a vertex from its patch, in cubes; a larger one mixes two walls."""
-_FEWEST_OF_PIECE = 20
-"""Least number of triangles of a connected piece; smaller ones are outliers."""
+_WALLS_ASKED = 4000  # number of points at which the wall thickness is measured
+_OPPOSITE = 0.7  # cosine of the largest angle (45 deg) between the normals of two opposite sides, one of them reversed
+_FARTHEST_CUBES = 0.75  # largest distance of a vertex from its patch, in cubes; a larger one mixes two walls
+_FEWEST_OF_PIECE = 20  # least number of triangles of a connected piece; smaller ones are outliers
 
 
 def mesh(

@@ -30,8 +30,7 @@ from uwlts.runtime.progress import ProgressListener
 from uwlts.runtime.workers import run_jobs
 from uwlts.storage.cloud_files import CLOUD_FORMATS, load_cloud, name_cloud, write_cloud
 
-_POLITE = 10
-"""Reduction of the worker's priority in favour of a recording, as by ``nice``."""
+_POLITE = 10  # reduction of the worker's priority in favour of a recording, as by ``nice``
 _FILES: Mapping[str, str] = MappingProxyType(
     {
         "capture": "capture",
@@ -57,10 +56,8 @@ _LABELS = {
     "pose_std_deg": "pose std, deg",
 }
 """Labels of fields whose parameters have no telling names."""
-SHAPES = ("plane", "sphere", "cylinder")
-"""Ideal shapes, which a reference may be instead of a file."""
-_FORMAT = "format"
-"""Field for the format of an export: the ending of its file."""
+SHAPES = ("plane", "sphere", "cylinder")  # ideal shapes, which a reference may be instead of a file
+_FORMAT = "format"  # field for the format of an export: the ending of its file
 
 
 @dataclass(frozen=True)

@@ -34,8 +34,7 @@ _KINDS = {
     ".html": "report",
 }
 """Kinds by endings; the first that fits counts."""
-_LONGEST_NAME = 200
-"""Longest name of a new file in bytes: file systems allow 255, including appended endings."""
+_LONGEST_NAME = 200  # longest name of a new file in bytes: file systems allow 255, including appended endings
 
 
 @dataclass(frozen=True)

@@ -40,14 +40,11 @@ from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import Capture, Frame, drawable_image, part_path
 from uwlts.stripe import Stripe
 
-_PREVIEW_S = 0.15
-"""Pause between two live images."""
-_MOST_LOST = 2
-"""Consecutive live images that may be lost before an error is reported."""
+_PREVIEW_S = 0.15  # pause between two live images
+_MOST_LOST = 2  # consecutive live images that may be lost before an error is reported
 _UNATTENDED_S = 5.0
 """Time without an operator's page after which live images with the laser end: loading it again takes less."""
-_EARLIER = 200
-"""Images of an interrupted scan that are shown again when it is continued."""
+_EARLIER = 200  # images of an interrupted scan that are shown again when it is continued
 
 
 class InstrumentState(StrEnum):

@@ -21,23 +21,18 @@ from uwlts.desk.access import PageAccess
 
 HEAD_BYTES = 64 * 1024
 """Longest head of a request. Browsers send some KB, including cookies of other programs on the machine."""
-HEAD_S = 5.0
-"""Longest duration of a request, even in a slow network."""
-BACKLOG = 64
-"""Connections accepted at once. Below the limit, so that the newest request is read before one is closed."""
+HEAD_S = 5.0  # longest duration of a request, even in a slow network
+BACKLOG = 64  # Connections accepted at once. Below the limit, so that the newest request is read before one is closed.
 _MOST_REQUESTS = 256
 """Requests at once; the oldest is closed, so that others cannot block the operator. A process may open 1024 files."""
 PRESS = re.compile(r"(off|escape)-\d{1,40}")
 """Name of a press, made by the page. It reaches the program on two paths, and is obeyed once."""
-MESSAGE_BYTES = 4096
-"""Longer than every message between the two processes."""
+MESSAGE_BYTES = 4096  # longer than every message between the two processes
 _SOFT_RESET = b"\x18"
 _ESCAPE_S = 0.2
 """Escape also closes menus. Within this time the program may answer; otherwise the laser is switched off."""
-_AGAIN_S = 0.2
-"""Interval between repetitions of Ctrl-X: a command in progress may have switched the laser on again."""
-_GIVE_UP_S = 2.0
-"""A press has failed if no port has accepted Ctrl-X and the program has not answered for this time."""
+_AGAIN_S = 0.2  # interval between repetitions of Ctrl-X: a command in progress may have switched the laser on again
+_GIVE_UP_S = 2.0  # a press has failed if no port has accepted Ctrl-X and the program has not answered for this time
 _WATCH_S = 0.2  # period in which its state is looked at
 
 

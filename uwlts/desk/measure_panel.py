@@ -34,12 +34,9 @@ from uwlts.storage.cloud_files import name_cloud
 _WIDTH, _HEIGHT = 360, 220
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52, 10, 10, 36
 """Size of the plot and of its margins, px."""
-_TICKS = 5
-"""Wanted number of ticks of an axis."""
-_MOST_POINTS = 3000
-"""Points that are drawn; more would overlap."""
-_MARGIN = 0.05
-"""Margin around the points as a fraction of their range."""
+_TICKS = 5  # wanted number of ticks of an axis
+_MOST_POINTS = 3000  # points that are drawn; more would overlap
+_MARGIN = 0.05  # margin around the points as a fraction of their range
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,8 +35,7 @@ from uwlts.storage.cloud_files import read_thinned_cloud
 
 _LIST_S = 2.0  # period in which the list of files is read again
 _MOST_SHOWN = 300_000  # points, fluent on a tablet
-_MOST_OPENED = 5_000_000
-"""Points of a file that are kept in memory for measurements."""
+_MOST_OPENED = 5_000_000  # points of a file that are kept in memory for measurements
 _JOGS_MM = (-10.0, -1.0, -0.1, 0.1, 1.0, 10.0)  # steps of the buttons that move the stage
 _FREE = (InstrumentState.READY, InstrumentState.LOCKED)
 _RUNNING = (InstrumentState.SCANNING, InstrumentState.PAUSED)

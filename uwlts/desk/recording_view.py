@@ -18,12 +18,10 @@ from uwlts.storage.calibration_file import resolve_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, drawable_image, part_path
 from uwlts.stripe import find_stripe, warm_up
 
-LOOK_S = 0.1
-"""Interval between checks for new images; a check takes a few ms."""
+LOOK_S = 0.1  # interval between checks for new images; a check takes a few ms
 _DAMAGED_S = 5.0
 """Time after which a recording that cannot be read is damaged; an image is written in a fraction of a second."""
-_WAITING = 64
-"""Images in the queue for display during a scan; further ones are recorded but not shown."""
+_WAITING = 64  # images in the queue for display during a scan; further ones are recorded but not shown
 _FAINT, _MANY, _FEW = 0.1, 0.05, 0.05
 """Limits of a laser image: faint below this fraction of full scale; saturated above this fraction of saturated lines;
 too little of the stripe below this fraction of lines with a point."""

@@ -84,14 +84,10 @@ def _examine_port(port: str, description: str) -> Finding:
     return Finding("serial port", "warning", f"{named}: no permission", advice)
 
 
-FRAMES = 10
-"""Frames grabbed to test a camera."""
-_FRAME_S = 5.0
-"""Longest wait for a frame, s."""
-_BRIGHTEST_MEDIAN = 0.9
-"""Median grey value, as a fraction of the full scale, above which an image is overexposed."""
-_DARKEST_MEAN = 0.002
-"""Mean grey value, as a fraction of the full scale, below which an image is dark."""
+FRAMES = 10  # frames grabbed to test a camera
+_FRAME_S = 5.0  # longest wait for a frame, s
+_BRIGHTEST_MEDIAN = 0.9  # median grey value, as a fraction of the full scale, above which an image is overexposed
+_DARKEST_MEAN = 0.002  # mean grey value, as a fraction of the full scale, below which an image is dark
 
 BEHAVIOUR = {
     1: (255, "otherwise the motor leaves its step at rest"),

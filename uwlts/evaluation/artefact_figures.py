@@ -190,14 +190,10 @@ def _fit_cap(
     return members, fit_robustly(Sphere.fit, points[members])
 
 
-_MOST_REJECTED = 0.1
-"""Largest fraction of outliers; a larger one indicates another surface."""
-_DIAMETER_TOLERANCE = 0.2
-"""Largest relative error of a diameter; a larger one indicates another pipe."""
-_LEAST_ARC = np.pi
-"""Least visible arc, rad, for the ovality."""
-_SECTORS = 72
-"""Number of sectors (5 deg each) for measuring the arc."""
+_MOST_REJECTED = 0.1  # largest fraction of outliers; a larger one indicates another surface
+_DIAMETER_TOLERANCE = 0.2  # largest relative error of a diameter; a larger one indicates another pipe
+_LEAST_ARC = np.pi  # least visible arc, rad, for the ovality
+_SECTORS = 72  # number of sectors (5 deg each) for measuring the arc
 _LEAST_OF_PROFILE = 5
 """Least number of points on each face for the height of a profile; noise dominates a line through fewer."""
 

@@ -32,8 +32,7 @@ from uwlts.storage.cloud_files import load_cloud
 from uwlts.storage.number_tables import Unit
 from uwlts.storage.truth import Truth, TruthHeader, read_truth, scene_digest, truth_path
 
-TOLERANCE_MM = 0.010
-"""Tolerance for points from perfect images and true parameters (tests/system/test_campaign.py)."""
+TOLERANCE_MM = 0.010  # tolerance for points from perfect images and true parameters (tests/system/test_campaign.py)
 MOST_STRANGE = 0.3
 """Largest fraction of points that do not belong to an artefact without a warning. Chosen by hand: above edges and
 stands, and below one half, that of two scans in one."""

@@ -18,10 +18,8 @@ from uwlts.errors import CaptureError, Error, OutputError, describe_problems
 from uwlts.files.reading import MOST_JSON_BYTES, add_article, find_not_finite, log_warnings, parse_json, read_text
 from uwlts.files.writing import require_ending, write_atomically
 
-_SHOWN = 3
-"""Largest number of different entries that a message names."""
-_BRIEF = 80
-"""Largest number of characters of a value in a message."""
+_SHOWN = 3  # largest number of different entries that a message names
+_BRIEF = 80  # largest number of characters of a value in a message
 
 SEAL = "sha256"
 EDITED = "edited"

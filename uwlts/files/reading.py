@@ -34,8 +34,7 @@ MOST_TOML_BYTES = MiB
 MOST_JSON_BYTES = 32 * MiB  # several times the largest calibration
 MOST_VALUES = 500_000
 """Values in a JSON file, enough for a covariance of 700 parameters. As Python objects they take less than 100 MB."""
-MOST_DEPTH = 64
-"""Nesting of tables and lists; the program's own files have fewer than ten levels."""
+MOST_DEPTH = 64  # nesting of tables and lists; the program's own files have fewer than ten levels
 _LARGEST_INT = 2**63  # 64 bits, what NumPy and HDF5 hold
 _LONGEST_KEY = 32  # parts of a dotted key; the parser takes time by the square of their number
 

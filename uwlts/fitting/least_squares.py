@@ -15,21 +15,17 @@ from scipy.optimize import least_squares
 from uwlts.errors import EvaluationError
 from uwlts.model.calibration import rigid_transform
 
-MAD_TO_STD = 1.4826
-"""Standard deviation of a normal distribution divided by its median absolute deviation."""
+MAD_TO_STD = 1.4826  # standard deviation of a normal distribution divided by its median absolute deviation
 
 TUKEY_BOUND = 4.685
 """Bound of Tukey's biweight, in standard deviations: 95 % efficient for normal noise (Holland and Welsch,
 Communications in Statistics A 6, 1977)."""
 
-VDI_OUTLIER_SHARE = 0.003
-"""VDI/VDE 2634 permits rejecting at most 0.3 % of the points."""
+VDI_OUTLIER_SHARE = 0.003  # VDI/VDE 2634 permits rejecting at most 0.3 % of the points
 
-DEFAULT_K = 5.0
-"""Rejection limit in standard deviations: 6 in ten million points of normal noise exceed it."""
+DEFAULT_K = 5.0  # rejection limit in standard deviations: 6 in ten million points of normal noise exceed it
 
-_RETURNING_ROUNDS = 20
-"""Rounds after which rejected points no longer return, so that the iteration ends."""
+_RETURNING_ROUNDS = 20  # rounds after which rejected points no longer return, so that the iteration ends
 
 
 class Fit(Protocol):
@@ -99,10 +95,8 @@ def fit_robustly(fit: Callable[..., FitT], points: Any, *, k: float = DEFAULT_K,
         inliers = within
 
 
-_STEADY = 1e-6
-"""Largest change of a weight in the last round of reweighting."""
-_MOST_REWEIGHTED = 50
-"""Largest number of reweighted fits; each usually reduces the changes by a factor of three to ten."""
+_STEADY = 1e-6  # largest change of a weight in the last round of reweighting
+_MOST_REWEIGHTED = 50  # largest number of reweighted fits; each usually reduces the changes by a factor of three to ten
 _DEPENDENT = 1e-12
 """Eigenvalue of a normal matrix, relative to the largest, below which the columns are linearly dependent."""
 
@@ -142,11 +136,9 @@ def fit_biweight(design: np.ndarray, values: np.ndarray, counted: np.ndarray) ->
     return inverse @ (design * weights[:, None]).T, weights
 
 
-_SINGULAR = 1e-9
-"""Singular value, relative to the largest, that rounding of coordinates of unit size produces."""
+_SINGULAR = 1e-9  # singular value, relative to the largest, that rounding of coordinates of unit size produces
 
-_STEPS = 300
-"""Largest number of function evaluations."""
+_STEPS = 300  # largest number of function evaluations
 
 LARGEST_RELATIVE_STD = 0.2
 """Largest relative standard uncertainty of a radius; with a larger one, the shape may be a plane."""

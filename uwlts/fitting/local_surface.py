@@ -20,15 +20,11 @@ from scipy.spatial import KDTree
 from uwlts.runtime.compiled import compiled, compiled_with_arrays
 from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PointCloud
 
-_SAME_SIDE = 0.5
-"""Cosine of the largest angle (60 deg) between normals of points on the same side of a wall or an edge."""
-_FEWEST = 8
-"""Least number of points of a patch, which has six coefficients."""
-_MOST_IMAGES = 256
-"""Largest number of images of a patch that are distinguished; further ones are combined."""
+_SAME_SIDE = 0.5  # cosine of the largest angle (60 deg) between normals of points on the same side of a wall or an edge
+_FEWEST = 8  # least number of points of a patch, which has six coefficients
+_MOST_IMAGES = 256  # largest number of images of a patch that are distinguished; further ones are combined
 _TERMS = 6  # of a polynomial of second order in two variables
-_AT_A_TIME = 500_000
-"""Number of points whose normals are computed together; their matrices take 100 MB."""
+_AT_A_TIME = 500_000  # number of points whose normals are computed together; their matrices take 100 MB
 
 
 class PointGrid:
@@ -342,16 +338,11 @@ class PatchErrors:
         return csr_array((values.ravel(), self.near.ravel(), ends), shape=(len(self.near), len(self.counts)))
 
 
-POINTS_PER_DISC = 30
-"""Number of points of an averaging disc: the mean has about a fifth of their noise."""
-_IMAGES_PER_DISC = 3.0
-"""Least number of images in a disc, so that errors of single images average."""
-_SAMPLED = 2000
-"""Number of points for the median spacing, which is then accurate to a few percent."""
-_ASKED = 64
-"""Number of points for the median distance between images."""
-_STEEPEST = 0.3
-"""Least cosine of the angle between surface normal and laser, which limits the length of a footprint."""
+POINTS_PER_DISC = 30  # number of points of an averaging disc: the mean has about a fifth of their noise
+_IMAGES_PER_DISC = 3.0  # least number of images in a disc, so that errors of single images average
+_SAMPLED = 2000  # number of points for the median spacing, which is then accurate to a few percent
+_ASKED = 64  # number of points for the median distance between images
+_STEEPEST = 0.3  # least cosine of the angle between surface normal and laser, which limits the length of a footprint
 
 
 def choose_disc_diameter(points_mm: np.ndarray, frame: np.ndarray | None = None) -> float:

@@ -18,8 +18,7 @@ _MOST = 3  # largest number of parameters or directions to list
 _LEAST_SHARE = 0.1  # fraction of the variance of all functions; a direction with less is not listed
 _NAMED_SHARE = 0.4  # fraction of the most important parameter's contribution; others are not listed with it
 _CAUSE_SHARE = 0.3  # fraction of a direction that knowledge of one parameter must determine to count as its cause
-_CONFUSED = 0.3
-"""Smallest correlation eigenvalue below which parameters are inseparable: correlation of 0.7 for two."""
+_CONFUSED = 0.3  # smallest correlation eigenvalue below which parameters are inseparable: correlation of 0.7 for two
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,32 +20,22 @@ from uwlts.errors import EvaluationError
 from uwlts.fitting.local_surface import PatchErrors, number_cubes
 from uwlts.storage.cloud import PointUncertainty, project_image_errors, project_variance
 
-_CELLS_PER_RADIUS = 3.0
-"""Averaging cubes per disc radius: a disc contains 28 averages for 6 coefficients."""
+_CELLS_PER_RADIUS = 3.0  # averaging cubes per disc radius: a disc contains 28 averages for 6 coefficients
 _NEIGHBOURS = 40  # most averages in a disc; 28 are usual
-_FEWEST = 10
-"""Least number of averages in a disc; a second-order surface has 6 coefficients."""
-_ROUND = 0.3
-"""Least squared ratio of a disc's narrow to its wide extent; distant profiles give strips instead of discs."""
-_LARGEST_PATCH = 0.1
-"""Largest disc radius relative to the cloud's size; a larger disc is not local."""
-_LEAST_NOISE_MM = 1e-6
-"""Lower bound of a point's noise, mm, so that weights stay finite."""
-_ROUGH = 5.0
-"""Largest ratio of a patch's scatter to the median scatter; patches on edges exceed it."""
-_MOST = 15_000
-"""Number of patches above which they are thinned."""
-_SAMPLE = 400
-"""Number of discs used to find the radius."""
-_SAME_WAY = 0.8
-"""Least cosine (37 deg) between the normals of corresponding patches."""
+_FEWEST = 10  # least number of averages in a disc; a second-order surface has 6 coefficients
+_ROUND = 0.3  # least squared ratio of a disc's narrow to its wide extent; distant profiles give strips instead of discs
+_LARGEST_PATCH = 0.1  # largest disc radius relative to the cloud's size; a larger disc is not local
+_LEAST_NOISE_MM = 1e-6  # lower bound of a point's noise, mm, so that weights stay finite
+_ROUGH = 5.0  # largest ratio of a patch's scatter to the median scatter; patches on edges exceed it
+_MOST = 15_000  # number of patches above which they are thinned
+_SAMPLE = 400  # number of discs used to find the radius
+_SAME_WAY = 0.8  # least cosine (37 deg) between the normals of corresponding patches
 _FACING = 0.15
 """Least cosine (81 deg) between a normal and the viewing direction; a sensor sees little of steeper surfaces."""
 
 LEAST_INFORMATION = 5.0
 """Least information on a determined motion, relative to the information that noise of the normals alone produces."""
-ROUNDING = 1e-9
-"""Least information above rounding noise, relative to the information on the best determined motion."""
+ROUNDING = 1e-9  # least information above rounding noise, relative to the information on the best determined motion
 
 
 @dataclass(frozen=True, eq=False)

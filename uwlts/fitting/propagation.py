@@ -15,8 +15,7 @@ import numpy as np
 
 from uwlts.storage.cloud import PointCloud, PointUncertainty, expand_covariances, project_image_errors, project_variance
 
-_SEED = 635
-"""Seed of the draws, so that a cloud always has the same uncertainties."""
+_SEED = 635  # seed of the draws, so that a cloud always has the same uncertainties
 
 
 @dataclass(frozen=True, eq=False)

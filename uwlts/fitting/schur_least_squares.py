@@ -8,18 +8,12 @@ from scipy import sparse
 
 from uwlts.errors import CalibrationError
 
-_ROUNDS = 60
-"""Largest number of rounds: several times that of typical problems."""
-_SMALLEST_STEP = 1e-11
-"""Step, in the unit of residuals, that rounding of sums over all residuals produces."""
-_HARDLY_DAMPED = 1e-8
-"""Largest damping, relative to columns of unit length, of practically full Gauss-Newton steps."""
-_SAFE = 1e-7
-"""Largest relative gain for the linear model to replace an evaluation of all residuals."""
-_SINGULAR = 1e-13
-"""Eigenvalue of the normal matrix of the scaled global parameters, below which it is rounding noise."""
-_SMALL_BLOCK = 16
-"""Size of a matrix that is inverted as a whole: a search for its diagonal part would take as long."""
+_ROUNDS = 60  # largest number of rounds: several times that of typical problems
+_SMALLEST_STEP = 1e-11  # step, in the unit of residuals, that rounding of sums over all residuals produces
+_HARDLY_DAMPED = 1e-8  # largest damping, relative to columns of unit length, of practically full Gauss-Newton steps
+_SAFE = 1e-7  # largest relative gain for the linear model to replace an evaluation of all residuals
+_SINGULAR = 1e-13  # eigenvalue of the normal matrix of the scaled global parameters, below which it is rounding noise
+_SMALL_BLOCK = 16  # size of a matrix that is inverted as a whole: a search for its diagonal part would take as long
 
 
 @dataclass(frozen=True, eq=False)

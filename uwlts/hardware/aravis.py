@@ -119,12 +119,9 @@ def _text(value: bytes | None) -> str:
     return "" if value is None else value.decode(errors="replace")
 
 
-_ANSWER_S = 0.1
-"""Time limit for the answer of a camera on this machine; it takes a few ms."""
-_HEARTBEAT_S = 4.0
-"""The heartbeat timeout of GigE Vision is 3 s unless a program has changed it."""
-_SOCKET_BYTES = 2**23
-"""Capacity for the packets of several frames of 1280 x 1024 px."""
+_ANSWER_S = 0.1  # time limit for the answer of a camera on this machine; it takes a few ms
+_HEARTBEAT_S = 4.0  # the heartbeat timeout of GigE Vision is 3 s unless a program has changed it
+_SOCKET_BYTES = 2**23  # capacity for the packets of several frames of 1280 x 1024 px
 # GigE Vision's discovery command: key, acknowledge, command 2, no payload, request 1.
 _DISCOVERY = b"\x42\x01\x00\x02\x00\x00\x00\x01"
 _LOOPBACK, _CONTROL_PORT = "127.0.0.1", 3956

@@ -32,22 +32,18 @@ CENTRE_LINES = "Coord3D_C16"
 LINE_RATE, LINE_SELECTOR = "AcquisitionLineRate", "ChunkScanLineSelector"
 """Features of 3D cameras: the profile rate in Hz, and the selector of the profile whose chunk data are read."""
 
-CHUNKS = ("EncoderValue", "Timestamp")
-"""Requested chunk data; the name of each feature is prefixed with ``Chunk``."""
+CHUNKS = ("EncoderValue", "Timestamp")  # requested chunk data; the name of each feature is prefixed with ``Chunk``
 
 PLAIN: dict[str, bool | int | float] = dict.fromkeys(["ReverseX", "ReverseY", "LUTEnable", "GammaEnable"], False)
 PLAIN |= dict.fromkeys(["BinningHorizontal", "BinningVertical", "DecimationHorizontal", "DecimationVertical"], 1)
 PLAIN |= {"Gamma": 1.0}
 """Features (GenICam SFNC 2.7) and their values for images as on the image sensor, with grey values linear in light."""
 
-BUFFERS = 32
-"""Capacity of a driver's frame queue: half a second at 60 frames/s. Further frames are lost."""
+BUFFERS = 32  # Capacity of a driver's frame queue: half a second at 60 frames/s. Further frames are lost.
 MONO_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono14": 14, "Mono16": 16}
 """Bit depths of the grey formats. Packed formats are omitted: few cameras offer only them."""
-COORDINATE_BITS = 16
-"""Bit depth of the values in `CENTRE_LINES`."""
-_WAIT_S = 0.1
-"""Longest single wait in a driver's library, during which Ctrl-C has no effect."""
+COORDINATE_BITS = 16  # bit depth of the values in `CENTRE_LINES`
+_WAIT_S = 0.1  # longest single wait in a driver's library, during which Ctrl-C has no effect
 # GigE Vision 1.x counts frames in 16 bits and skips 0.
 _COUNTER_16_BIT = 2**16 - 1
 

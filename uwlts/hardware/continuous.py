@@ -33,17 +33,13 @@ from uwlts.stripe import find_stripe, warm_up
 
 _SPARE_MM, _SPARE_S = 1.0, 0.3
 """Travel at constant speed before and after the stored frames: a distance, and in addition a time."""
-_TRIGGERS = 8
-"""Triggered frames used to compare the clocks; the one with the shortest delay counts."""
-_PATIENCE_S = 3.0
-"""Longest wait for a frame beyond its exposure."""
+_TRIGGERS = 8  # triggered frames used to compare the clocks; the one with the shortest delay counts
+_PATIENCE_S = 3.0  # longest wait for a frame beyond its exposure
 _GAP_S = 0.8
 """Longest gap between frames while the laser is on, including the braking time. Its detection takes 0.1 s more."""
-_SLOW_REPORT = 2.0
-"""Reports that took this many times as long as the fastest are ignored: their time is less certain."""
+_SLOW_REPORT = 2.0  # reports that took this many times as long as the fastest are ignored: their time is less certain
 _FEWEST_REPORTS = 4  # of the stage's position: two determine the motion, the others check it
-_BUSY = 0.9
-"""Largest fraction of the frame period that the exposure may take."""
+_BUSY = 0.9  # largest fraction of the frame period that the exposure may take
 
 
 @dataclass(frozen=True)

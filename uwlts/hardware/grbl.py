@@ -39,14 +39,11 @@ _PIN_MARGIN_MM = 0.5
 LIVE_S = 0.4
 """Dwell of a renewed light. The controller holds at most two, so that the light ends within 0.9 s. It holds at least
 one after a call of `GrblStage.keep_lit`, whose interval may be half a second, as the guard allows 0.8 s."""
-_LIGHTS_S = 0.3
-"""Time limit of the controller to switch the laser, which takes a few ms."""
+_LIGHTS_S = 0.3  # time limit of the controller to switch the laser, which takes a few ms
 _SWEEP_S = 0.9
 """Time within which a stage that receives no further part of its travel comes to rest and switches the laser off."""
-_LAG_S = 0.3
-"""Travel time at full speed that remains if the next part is delayed by a report and a busy computer."""
-_FULL = 0.9
-"""Fraction of the set power that counts as reached, because the reported speed is rounded."""
+_LAG_S = 0.3  # travel time at full speed that remains if the next part is delayed by a report and a busy computer
+_FULL = 0.9  # fraction of the set power that counts as reached, because the reported speed is rounded
 
 
 @dataclass(frozen=True)

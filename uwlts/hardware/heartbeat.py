@@ -18,10 +18,8 @@ from uwlts.hardware import laser_guard
 GRACE_S = 0.8
 """A program without progress for this long, beyond announced waits, counts as hung. The laser must be off within 1 s,
 and the guard needs a few ms to wake up and send."""
-BEAT_S = 0.1
-"""Longest time between two beats in a waiting loop."""
-_ANSWER_S = 0.5
-"""Time limit of the guard's answer, which takes less than 1 ms unless the guard is suspended."""
+BEAT_S = 0.1  # longest time between two beats in a waiting loop
+_ANSWER_S = 0.5  # time limit of the guard's answer, which takes less than 1 ms unless the guard is suspended
 _END_S = 3.0  # for the guarding process to end
 
 GuardState = Literal["watching", "switched off", "gone"]

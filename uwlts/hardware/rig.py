@@ -26,25 +26,17 @@ from uwlts.stripe import Stripe, StripeStatus, extract_stripe
 
 BRIGHT_SHARE = 0.98
 """Quantile of the peak values of the considered lines; 2 % of the lines may be brighter than requested."""
-START_MS = 1.0
-"""First exposure: in the middle of the usual range, on a logarithmic scale."""
+START_MS = 1.0  # first exposure: in the middle of the usual range, on a logarithmic scale
 _FEW_SHARE = 0.01
 _FEWEST_LINES = 3
 """Smallest fraction and number of lines with a stripe; fewer are attributed to a reflection or noise."""
-_DIM_SHARE = 0.05
-"""Lines below this fraction of the brightest one are dark."""
-_MANY_SHARE = 0.05
-"""A larger fraction of saturated lines cannot be attributed to a reflection."""
-_CLOSE = 0.1
-"""Relative change of the exposure that ends the search."""
-_SHORTEST_MS = 1e-3
-"""Shortest exposure of usual cameras."""
-_STEPS = 12
-"""Largest number of images: either end of the range is reached in three, and bisection takes a few more."""
-_DOWN = 1 / 16
-"""Factor after a saturated image, whose excess is unknown."""
-_UP = 30.0
-"""Largest factor after a dark image, because noise limits the estimate."""
+_DIM_SHARE = 0.05  # lines below this fraction of the brightest one are dark
+_MANY_SHARE = 0.05  # a larger fraction of saturated lines cannot be attributed to a reflection
+_CLOSE = 0.1  # relative change of the exposure that ends the search
+_SHORTEST_MS = 1e-3  # shortest exposure of usual cameras
+_STEPS = 12  # largest number of images: either end of the range is reached in three, and bisection takes a few more
+_DOWN = 1 / 16  # factor after a saturated image, whose excess is unknown
+_UP = 30.0  # largest factor after a dark image, because noise limits the estimate
 
 
 def get_stripe(seen: Seen, sensor: Sensor, *, background: np.ndarray | None = None) -> Stripe:
@@ -141,12 +133,9 @@ is off for the last part."""
 _LIGHT_S = 0.5
 """Longest light beyond an exposure: the camera's delay before the exposure and, because the light usually ends with the
 frame, the transfer time. The controller ends the light within 0.1 s more, so that the total stays below a second."""
-_LATENCIES = 8
-"""Frames for comparison with a late one: only a few, because the clocks of camera and computer drift."""
-_PROMPT_S = 0.1
-"""Longest delay between a trigger and the start of the exposure."""
-_RUN_UP_MM = 1.0
-"""More than the backlash of a ball screw or belt."""
+_LATENCIES = 8  # frames for comparison with a late one: only a few, because the clocks of camera and computer drift
+_PROMPT_S = 0.1  # longest delay between a trigger and the start of the exposure
+_RUN_UP_MM = 1.0  # more than the backlash of a ball screw or belt
 
 
 def add_provenance(

@@ -28,8 +28,7 @@ def _unit(value: Vector) -> Vector:
     return x / length, y / length, z / length
 
 
-Direction = Annotated[Vector, AfterValidator(_unit)]
-"""Vector normalised to a unit vector."""
+Direction = Annotated[Vector, AfterValidator(_unit)]  # vector normalised to a unit vector
 
 
 class StageSettings(Description):

@@ -22,16 +22,11 @@ from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Seen
 from uwlts.stripe import Stripe, StripeStatus
 
-LOOKS = 9
-"""Number of positions searched for a stripe before a scan is given up."""
-_DROP = 0.5
-"""A stripe whose number of lines or level is below this fraction of the previous image's is checked."""
-_AGAIN = 25
-"""Number of images without a stripe after which the laser is checked again."""
-_SAME_PX = 1.0
-"""Stripes of two images within this distance are the same; edges caused by noise are displaced more."""
-_ITS_OWN = 0.5
-"""Smallest fraction of the stripe's height that vanishes when the laser is switched off."""
+LOOKS = 9  # number of positions searched for a stripe before a scan is given up
+_DROP = 0.5  # a stripe whose number of lines or level is below this fraction of the previous image's is checked
+_AGAIN = 25  # number of images without a stripe after which the laser is checked again
+_SAME_PX = 1.0  # stripes of two images within this distance are the same; edges caused by noise are displaced more
+_ITS_OWN = 0.5  # smallest fraction of the stripe's height that vanishes when the laser is switched off
 
 
 def select_evenly(positions_mm: Sequence[float], count: int) -> list[float]:
@@ -131,18 +126,13 @@ class LaserWatch:
         )
 
 
-LARGEST_MM = 0.05
-"""Largest slip that is not reported: four steps of 0.0125 mm, comparable with the sensor's errors."""
+LARGEST_MM = 0.05  # largest slip that is not reported: four steps of 0.0125 mm, comparable with the sensor's errors
 _LEAST_RELIEF = 0.2
 """Smallest motion of the stripe in px per mm of the stage on lines that are used; below it noise dominates."""
-_LARGEST_BEND_PX = 2.0
-"""A larger change of the motion between two images is caused by an edge."""
-_FEWEST_LINES = 20
-"""Fewest lines for a median and its scatter."""
-_SIGMAS = 4.0
-"""A slip within this many standard errors is not reported: 6e-5 false alarms per scan."""
-_GRAIN = 2.0
-"""Factor on the standard error of a mean, because neighbouring lines share their speckle."""
+_LARGEST_BEND_PX = 2.0  # a larger change of the motion between two images is caused by an edge
+_FEWEST_LINES = 20  # fewest lines for a median and its scatter
+_SIGMAS = 4.0  # a slip within this many standard errors is not reported: 6e-5 false alarms per scan
+_GRAIN = 2.0  # factor on the standard error of a mean, because neighbouring lines share their speckle
 
 
 @dataclass(frozen=True, eq=False)

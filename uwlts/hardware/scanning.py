@@ -62,10 +62,8 @@ def open_camera(address: str) -> CameraDevice:
     return camera
 
 
-_FAINT = 0.1
-"""Laser images below this fraction of full scale are reported as faint."""
-_EXPOSED_AT = 5
-"""Number of positions, evenly distributed over a plan, used by automatic exposure."""
+_FAINT = 0.1  # laser images below this fraction of full scale are reported as faint
+_EXPOSED_AT = 5  # number of positions, evenly distributed over a plan, used by automatic exposure
 
 
 @dataclass

@@ -23,8 +23,7 @@ from uwlts.inspection.features import COVERAGE, COVERAGE_FACTOR, SEED
 
 NODES = (-np.sqrt(3.0), 1 / 6), (0.0, 2 / 3), (np.sqrt(3.0), 1 / 6)
 """Places and weights of a normal distribution (Gauss-Hermite, exact to the fifth power)."""
-NO_WEIGHT = 1e-9
-"""Sum of absolute weights that counts as zero: rounding errors are smaller."""
+NO_WEIGHT = 1e-9  # sum of absolute weights that counts as zero: rounding errors are smaller
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,8 +124,7 @@ def _quadratic_row(u: np.ndarray) -> np.ndarray | None:
     return np.linalg.solve(normal, np.eye(3)[0]) @ (design * weight[:, None]).T
 
 
-_DRAWS = 2000
-"""Noise draws: fifty exceed the 97.5 % quantile, which is then known to a tenth of a standard deviation."""
+_DRAWS = 2000  # noise draws: fifty exceed the 97.5 % quantile, which is then known to a tenth of a standard deviation
 BIAS_FACTOR = 1 / (np.sqrt(2) - 1)
 """Bias by the noise divided by the increase when the noise is added once more, for a bias proportional to its std."""
 

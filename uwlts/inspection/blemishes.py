@@ -75,8 +75,7 @@ class _Rule:
     enough for the dozens of peaks of noise in a contour."""
 
 
-DENT_SHARE = 0.1
-"""Least length and width of a dent, as a fraction of the pipe's diameter; smaller hollows are pits."""
+DENT_SHARE = 0.1  # least length and width of a dent, as a fraction of the pipe's diameter; smaller hollows are pits
 
 _NODES = [(np.array([a, b]), u * v) for a, u in NODES for b, v in NODES]
 """Places and weights of a normal distribution in two dimensions."""

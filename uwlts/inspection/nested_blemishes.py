@@ -47,8 +47,7 @@ class _Rule:
     worst: float = 0.99  # quantile of these errors: edges cover a few percent of the window, other pits less than one
 
 
-_SMALLEST = 1e-12
-"""Lower bound of a scatter, mm, so that rounding of exact heights produces no outliers."""
+_SMALLEST = 1e-12  # lower bound of a scatter, mm, so that rounding of exact heights produces no outliers
 
 
 @dataclass(frozen=True, eq=False)

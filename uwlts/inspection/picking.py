@@ -23,8 +23,7 @@ _FITS: dict[Shape, Callable[[np.ndarray], Sphere | Plane | Cylinder]] = {
 }
 _MOST_POINTS = 20_000
 """Most points of a fit; with more points the errors common to all of them dominate."""
-_DRAWS = 8
-"""Noise draws; eight give a standard deviation to 27 %."""
+_DRAWS = 8  # noise draws; eight give a standard deviation to 27 %
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,10 +125,8 @@ def _figures(fit: Sphere | Plane | Cylinder) -> dict[str, float]:
     return form if isinstance(fit, Plane) else {"diameter": 2 * fit.radius_mm} | form
 
 
-_FEWEST_POINTS = 3
-"""Fewest points on each side of a step."""
-_SMALLEST_MM = 1e-6
-"""Shorter ways between two places have no direction."""
+_FEWEST_POINTS = 3  # fewest points on each side of a step
+_SMALLEST_MM = 1e-6  # shorter ways between two places have no direction
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,8 +25,7 @@ from uwlts.inspection.scanned_part import find_straight_pipe
 from uwlts.storage.cloud import FOOTPRINT, PointCloud
 from uwlts.storage.cloud_files import load_cloud
 
-_OVERLAP = 0.6
-"""Overlap, rad, of both sides of a pipe that is cut open, unless a gap of this size separates them."""
+_OVERLAP = 0.6  # overlap, rad, of both sides of a pipe that is cut open, unless a gap of this size separates them
 _BEYOND_CUT = 0.1
 """Largest angle of findings beyond the cut, rad. Farther points only serve as surroundings: on the other side of
 the cut the same blemishes are found with more surroundings."""
@@ -38,10 +37,8 @@ _THICKEST = 5
 _OFF_SURFACE = 0.35
 """Largest distance from the form of a point of the pipe's surface, as a fraction of the radius: dents of 15 % of the
 diameter, the deepest that codes assess, are 0.3 deep."""
-_MOVED = 0.2
-"""Change of the form, in standard deviations of a point, after which the surface is searched again."""
-_FEWEST_POINTS = 500
-"""Fewest points for a search on a pipe's surface."""
+_MOVED = 0.2  # change of the form, in standard deviations of a point, after which the surface is searched again
+_FEWEST_POINTS = 500  # fewest points for a search on a pipe's surface
 
 
 def inspect_pipe(

@@ -48,8 +48,7 @@ class PipeFormRule:
 
 FORM_RULE = PipeFormRule()
 
-_AT_A_TIME = 250_000
-"""Points whose terms are evaluated together, limited by memory."""
+_AT_A_TIME = 250_000  # points whose terms are evaluated together, limited by memory
 
 
 @dataclass(frozen=True, eq=False)

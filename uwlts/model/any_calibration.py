@@ -18,5 +18,4 @@ def calibration_digest(calibration: AnyCalibration) -> str:
     return digest
 
 
-_digests: dict[int, str] = {}
-"""Digests of calibrations in use, by `id`."""
+_digests: dict[int, str] = {}  # digests of calibrations in use, by `id`

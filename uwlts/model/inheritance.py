@@ -14,14 +14,11 @@ from uwlts.errors import DesignError
 from uwlts.model.placement import apparent_depth_mm, camera_from_object, laser_pose
 from uwlts.model.sensor import Sensor, Table, Window
 
-_SAME_WAVELENGTH_NM = 5.0
-"""Lasers of the same type differ by less."""
-_SAME = 0.1
-"""Relative change of a length, an angle or a power that can be an adjustment of the same part."""
+_SAME_WAVELENGTH_NM = 5.0  # lasers of the same type differ by less
+_SAME = 0.1  # relative change of a length, an angle or a power that can be an adjustment of the same part
 _BLUR_PX = 2.0
 """Largest diameter of the blur at the stand-off: its standard deviation of half a pixel widens a stripe by a tenth."""
-_THICKER = 1.05
-"""Largest thickness of the sheet at the stand-off, relative to that in its waist."""
+_THICKER = 1.05  # largest thickness of the sheet at the stand-off, relative to that in its waist
 
 _WAVELENGTH = "laser.wavelength_nm"
 _PLACEMENT = tuple(

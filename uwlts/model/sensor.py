@@ -56,8 +56,7 @@ def _check_mounting(rows: Rows) -> Rows:
 
 UnitVector = Annotated[Vector, AfterValidator(_check_unit)]
 
-_INDEX_FORMULA = 1.5e-5
-"""Uncertainty of the formula for the index of water, as stated by Quan and Fry (1995)."""
+_INDEX_FORMULA = 1.5e-5  # uncertainty of the formula for the index of water, as stated by Quan and Fry (1995)
 
 
 Table = Annotated[dict[str, JsonValue], BeforeValidator(to_jsonable_python), AfterValidator(require_plain)]
@@ -194,8 +193,7 @@ class Camera(Description):
 _POWELL_BEAM = 1.7
 """Squared radius of the beam at a Powell lens, relative to that of a flat line: the edges are 20 % brighter (assumed).
 """
-_POWELL_NODES = 97
-"""Linear interpolation between them is accurate to 1 % of the power in the middle."""
+_POWELL_NODES = 97  # linear interpolation between them is accurate to 1 % of the power in the middle
 _LARGEST_LOBE = 200.0
 """Largest offset plus radius of side lobes in radii of the sheet, beyond which they would fill the image."""
 

@@ -5,10 +5,8 @@ import html
 from collections.abc import Collection, Mapping, Sequence, Set
 from pathlib import Path
 
-_LONGEST = 60
-"""Largest number of characters of a value that is shown completely."""
-_MOST = 8
-"""Largest number of items of a value that is shown completely."""
+_LONGEST = 60  # largest number of characters of a value that is shown completely
+_MOST = 8  # largest number of items of a value that is shown completely
 
 
 class Brief:

@@ -16,12 +16,10 @@ from uwlts.model.calibration import is_rigid
 from uwlts.model.short_text import Brief
 
 _ROUNDED = 1e-6  # deviation of poses and correlations that files with six digits have
-_LARGEST_DRIFT_PPM = 10_000.0
-"""A hundred times the drift of the worst quartz; larger values indicate a wrong unit."""
+_LARGEST_DRIFT_PPM = 10_000.0  # a hundred times the drift of the worst quartz; larger values indicate a wrong unit
 _CLOCKS_S = {18: "UTC and GNSS", 19: "GNSS and TAI", 37: "UTC and TAI"}
 """Whole seconds between time scales since 2017 (IERS Bulletin C)."""
-_UNIX_S = 946_684_800.0, 4_102_444_800.0
-"""Unix times from 2000 to 2100."""
+_UNIX_S = 946_684_800.0, 4_102_444_800.0  # Unix times from 2000 to 2100
 COVARIANCE_COLUMNS = {f"cov_{i}{j}": (i, j) for i in range(6) for j in range(i, 6)}
 """Names of a file's columns with the upper triangle of each covariance, and their row and column in it."""
 

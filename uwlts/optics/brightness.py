@@ -30,11 +30,9 @@ BLUR_STD = 1.0 / math.sqrt(3.0)
 """Standard uncertainty of the blur shift, divided by the largest possible shift. The shift is not corrected; any value
 between zero and the largest is equally likely (JCGM 100:2008, 4.3.7)."""
 
-_MOST_BLUR_PX = 0.1
-"""Limit of the blur shift, about the shift by speckle. Centres above it are rejected."""
+_MOST_BLUR_PX = 0.1  # Limit of the blur shift, about the shift by speckle. Centres above it are rejected.
 
-_REACH_MM = 2.0
-"""Largest stage distance of images whose brightness is compared."""
+_REACH_MM = 2.0  # largest stage distance of images whose brightness is compared
 
 _LEAST_APART_MM = 0.05
 """Least standard deviation of the stage positions of compared images: a third of the sheet's thickness."""
@@ -55,11 +53,9 @@ _FOOTPRINT_PER_SHEET = math.sqrt(3.0)
 _METHOD_STD = 0.15
 """Relative standard uncertainty of the squared factor because of the stripe method. The square ranges from 2.3 to 3.8
 instead of 3: the weights of the profile fit depend on the stripe's brightness and on speckle."""
-_PIXEL_VARIANCE = 1.0 / 12.0
-"""Variance of a pixel's width in px^2: a lower limit of blur."""
+_PIXEL_VARIANCE = 1.0 / 12.0  # variance of a pixel's width in px^2: a lower limit of blur
 
-_MOVED_PX = 0.5
-"""Step in px for derivatives of the points with respect to the stripe centre."""
+_MOVED_PX = 0.5  # step in px for derivatives of the points with respect to the stripe centre
 
 
 @dataclass(frozen=True, eq=False)

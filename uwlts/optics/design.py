@@ -28,22 +28,16 @@ from uwlts.errors import DesignError, RangeError
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Camera, Medium, Sensor, Window
 
-Array = Any
-"""NumPy array, Dr.Jit array, or number."""
+Array = Any  # NumPy array, Dr.Jit array, or number
 Vector = tuple[Array, Array, Array]
 
 _NEWTON_STEPS = 4  # of the ray through the window; converges quadratically
-_UNDISTORTING_STEPS = 100
-"""Largest number of iterations; strong distortion converges slowly."""
-_UNDISTORTED_PX = 1e-3
-"""Tolerance of undistorted points, sufficient for a drawing."""
-_TINY_MM = 1e-9
-"""Offset that avoids an undefined direction for a point on the window's normal; negligible."""
+_UNDISTORTING_STEPS = 100  # largest number of iterations; strong distortion converges slowly
+_UNDISTORTED_PX = 1e-3  # tolerance of undistorted points, sufficient for a drawing
+_TINY_MM = 1e-9  # offset that avoids an undefined direction for a point on the window's normal; negligible
 _EDGE_STEPS = 5  # Newton steps to an edge of the image; converges quadratically from a close start
-_NEAREST_MM = 1.0
-"""Least distance of the sheet's entry into the image from the window's outer face."""
-FARTHEST_MM = 1e6
-"""Largest distance of the sheet's exit from the image, from the pupil; no water is transparent as far."""
+_NEAREST_MM = 1.0  # least distance of the sheet's entry into the image from the window's outer face
+FARTHEST_MM = 1e6  # largest distance of the sheet's exit from the image, from the pupil; no water is transparent as far
 CLAMPED, UNCLAMPED = 0.75, 1.125
 """K_w of thesis Eq. 3.2. Plate theory (Timoshenko) gives 3/4 for a clamped edge and 3 (3 + nu) / 8 for a supported one.
 The value 1.125 assumes Poisson's ratio nu = 0; glass with nu = 0.2 would have 1.2."""

@@ -10,10 +10,8 @@ from uwlts.model.sensor import Camera, CaptureHeader
 _LARGEST_INDEX_CHANGE = 1e-3
 """Limit for the medium's index, about the change from 20 to 30 degC. Polynomials contain the refraction of their own
 calibration, so that the change causes an error of 0.2 mm at 300 mm."""
-_LARGEST_CHANGE_NM = 5.0
-"""Limit for the laser's wavelength: lasers of the same type differ by less."""
-_OTHER_LENS = 1.1
-"""Limit for the ratio of two focal lengths: lenses of the same type differ by less."""
+_LARGEST_CHANGE_NM = 5.0  # limit for the laser's wavelength: lasers of the same type differ by less
+_OTHER_LENS = 1.1  # limit for the ratio of two focal lengths: lenses of the same type differ by less
 
 
 def _check_images(camera: Camera, calibration: AnyCalibration, *, source: str) -> None:

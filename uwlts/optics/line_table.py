@@ -15,18 +15,15 @@ from numpy.polynomial import chebyshev
 
 from uwlts.runtime.compiled import compiled, compiled_part
 
-_NODES = (12, 8), (24, 24)
-"""Numbers of nodes along lines and centres, tried in turn."""
+_NODES = (12, 8), (24, 24)  # numbers of nodes along lines and centres, tried in turn
 
-_KEPT = 16
-"""Number of cached tables, of the most recently used functions."""
+_KEPT = 16  # number of cached tables, of the most recently used functions
 
 _WIDER = 64
 """Numbers of lines and pixels of a table are rounded up to multiples of this, so that it covers the next scan with
 the same calibration."""
 
-_WORTH = 5000
-"""Least number of centres that is worth a table: making one costs about as much as a thousand evaluations."""
+_WORTH = 5000  # least number of centres that is worth a table: making one costs about as much as a thousand evaluations
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,7 @@ from uwlts.pages.toolkit import FigureCollector, render_page, unit_for, write_pa
 
 MOST_SHOWN = 200_000
 """Largest number of points in a view of its own: about 1 MB, which every browser turns without delay."""
-_HEIGHT_PX = 600
-"""Height of a view in a notebook."""
+_HEIGHT_PX = 600  # height of a view in a notebook
 
 
 def choose_points(

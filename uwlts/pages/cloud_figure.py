@@ -23,8 +23,7 @@ PARTS: dict[CloudField, str] = {
 }
 """Captions of the parts of the uncertainty."""
 
-VIEW = Path(__file__).with_name("cloud_view.js")
-"""Component of Vue that draws a cloud; the desk uses it, too."""
+VIEW = Path(__file__).with_name("cloud_view.js")  # component of Vue that draws a cloud; the desk uses it, too
 _SPEC = find_spec("nicegui")
 assert _SPEC is not None and _SPEC.origin is not None
 # The specification is enough: importing NiceGUI takes a second.
@@ -46,13 +45,10 @@ STOPS = (
 )
 """Colour scale of deviations: position between -1 and +1 limit (0 to 1), and red, green, blue."""
 
-LIMIT_STD = 2.0
-"""Range of the deviation colours in standard deviations, as in the thesis."""
+LIMIT_STD = 2.0  # range of the deviation colours in standard deviations, as in the thesis
 
-AZIMUTH_DEG = 28.0
-"""Viewing direction of clouds: angle from +X towards +Y, deg."""
-ELEVATION_DEG = 38.0
-"""Viewing direction of clouds: angle downwards (towards +Z), deg."""
+AZIMUTH_DEG = 28.0  # viewing direction of clouds: angle from +X towards +Y, deg
+ELEVATION_DEG = 38.0  # viewing direction of clouds: angle downwards (towards +Z), deg
 
 
 def view_direction() -> np.ndarray:

@@ -52,8 +52,7 @@ import tempfile
 
 from uwlts.errors import SetupError
 
-MISSING = "-"
-"""Placeholder for a missing value in tables of text."""
+MISSING = "-"  # placeholder for a missing value in tables of text
 
 INK, SOFT, FAINT, BLUE, RED = "#2b3440", "#5c6875", "#dde2e8", "#3573b1", "#b5303c"
 """Colours of text, notes, grid lines, and of the main and the contrasting line, as in ``style.css``."""
@@ -111,8 +110,7 @@ def render_page(package: str, template: str, /, *, interactive: FigureCollector 
     )
 
 
-HTML = (".html", ".htm")
-"""File name endings of pages."""
+HTML = (".html", ".htm")  # file name endings of pages
 
 
 def write_page(
@@ -323,8 +321,7 @@ def typeset_number(text: str) -> str:
 BROWSERS = ("chromium", "chromium-headless-shell", "google-chrome", "google-chrome-stable", "msedge")
 """Names of browsers on PATH; the environment variable CHROMIUM names another one."""
 
-_PATIENCE_S = 120.0
-"""Time limit: a page with a few pictures takes 2 s, or much longer on a slow machine."""
+_PATIENCE_S = 120.0  # time limit: a page with a few pictures takes 2 s, or much longer on a slow machine
 
 
 def print_pdf(page: str, path: Path, *, overwrite: bool = False) -> None:

@@ -20,14 +20,11 @@ from uwlts.runtime.optional_library import optional_library
 
 _TRIES = ((0.55, 2.0, 6.0), (0.55, 3.0, 5.0), (0.8, 2.0, 6.0), (0.8, 3.0, 5.0), (1.6, 3.0, 5.0))
 """Voxel size (unit: patch radius), normal radius and feature radius (unit: voxel) of each attempt."""
-_VOXEL_UNITS = 0.3
-"""Default voxel size of KISS-Matcher, in its own units."""
+_VOXEL_UNITS = 0.3  # default voxel size of KISS-Matcher, in its own units
 _LEAST_SHARE = 0.6
 """Least fraction of overlapping patches that coincide within their noise; at a wrong pose only a few do."""
-_LEAST_OVERLAP = 30
-"""Least number of coinciding patches of a matched pair; a few coincide by chance."""
-_CLOSE = 5.0
-"""Largest distance of coinciding patches, in standard deviations."""
+_LEAST_OVERLAP = 30  # least number of coinciding patches of a matched pair; a few coincide by chance
+_CLOSE = 5.0  # largest distance of coinciding patches, in standard deviations
 
 
 def estimate_coarse_poses(

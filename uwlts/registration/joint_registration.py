@@ -31,28 +31,21 @@ from uwlts.fitting.patches import (
 )
 from uwlts.registration.marker_spheres import MarkerSphere, group_markers
 
-FEWEST_OF_PAIR = 12
-"""Least number of patches of a usable overlap: two for each of the six parameters of a rigid motion."""
+FEWEST_OF_PAIR = 12  # least number of patches of a usable overlap: two for each of the six parameters of a rigid motion
 _OWN_PART = 1e-4
 """Variance of each amplitude that is independent in every scan: 1 % of its errors change with temperature and load."""
-_NARROWER = 0.8
-"""Factor on the matching distance from one round to the next."""
+_NARROWER = 0.8  # factor on the matching distance from one round to the next
 _PAIR_REACH = 4.0
 """Matching distance in the first round of a pair fit (unit: patch radius); a search is accurate to about one radius."""
-_PAIR_ROUNDS = 12
-"""Rounds of a pair fit; after seven the matching distance is one patch radius."""
+_PAIR_ROUNDS = 12  # rounds of a pair fit; after seven the matching distance is one patch radius
 _LEAST_SPREAD = 0.05
 """Lower bound of the scatter relative to noise that is not stated: exact surfaces agree better than their patches."""
-ROUNDS = 60
-"""Largest number of rounds towards each other; 20 rounds narrow the matching distance a hundredfold."""
-_REFITS = 12
-"""Largest number of further rounds, with surfaces fitted again at each distance."""
+ROUNDS = 60  # largest number of rounds towards each other; 20 rounds narrow the matching distance a hundredfold
+_REFITS = 12  # largest number of further rounds, with surfaces fitted again at each distance
 _SETTLED = 0.1
 """Step, in standard uncertainties, below which a pose is settled: it would add 0.5 % to the standard uncertainty."""
-_STILL_MM = 1e-5
-"""Rms shift of the points, mm, that ends the iteration: far below any measurable change."""
-_SPHERE_REACH = 0.25
-"""Largest distance between the centres of one sphere in two scans, relative to its diameter."""
+_STILL_MM = 1e-5  # rms shift of the points, mm, that ends the iteration: far below any measurable change
+_SPHERE_REACH = 0.25  # largest distance between the centres of one sphere in two scans, relative to its diameter
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,10 +13,8 @@ from uwlts.fitting.propagation import LinearisedFit
 from uwlts.shapes.sphere import Sphere
 from uwlts.storage.cloud import PointCloud
 
-_AGREE = 0.05
-"""Tolerance of centre distances before registration, relative to the sphere diameter."""
-_TRIPLES = 200
-"""Number of sphere triples that are tried, spread evenly over all; up to six spheres give fewer."""
+_AGREE = 0.05  # tolerance of centre distances before registration, relative to the sphere diameter
+_TRIPLES = 200  # number of sphere triples that are tried, spread evenly over all; up to six spheres give fewer
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,8 +10,7 @@ from uwlts.registration.joint_registration import JointRegistration
 from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, NO_INDEX, PointCloud, PointUncertainty, rotate_covariances
 
 _BLOCK = 50_000  # points, to limit memory
-_LEFT_OUT = 1e-4
-"""Largest fraction of the patterns' total variance in omitted patterns; it is 1 % of the rms shift."""
+_LEFT_OUT = 1e-4  # largest fraction of the patterns' total variance in omitted patterns; it is 1 % of the rms shift
 
 
 def merge_clouds(

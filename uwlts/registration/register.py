@@ -43,12 +43,9 @@ from uwlts.storage.repeated_points import find_repeated
 
 _SMALLEST = 1e-6
 """Smallest length in mm or angle in deg that is accepted, and the reciprocal of the largest: others are slips."""
-_REACH = 0.05
-"""Default distance between overlapping surfaces at the initial poses, relative to the scan's size."""
-_ROUNDED = 1e-6
-"""Largest error of a rotation matrix element that rounding in a file may cause."""
-_PART = 0.1
-"""Least component of a scan in an undetermined direction, relative to the largest, that is reported."""
+_REACH = 0.05  # default distance between overlapping surfaces at the initial poses, relative to the scan's size
+_ROUNDED = 1e-6  # largest error of a rotation matrix element that rounding in a file may cause
+_PART = 0.1  # least component of a scan in an undetermined direction, relative to the largest, that is reported
 _NO_TURN = 0.05
 """Smallest fraction of a motion's rms shift by rotation; below it, the motion counts as a pure translation."""
 

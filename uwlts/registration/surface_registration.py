@@ -21,8 +21,7 @@ _NAMES = "shift along x", "shift along y", "shift along z", "turn about x", "tur
 _OPEN_SHARE = 1e-3
 """Information on a direction, relative to the best determined one, below which the direction is undetermined. Errors of
 images tilt the normals of a plane by as much."""
-_KNOWN = 1e12
-"""Prior information on the amplitudes of systematic patterns: they are not estimated here, but propagated."""
+_KNOWN = 1e12  # prior information on the amplitudes of systematic patterns: they are not estimated here, but propagated
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,8 +3,11 @@ from .acceptance_page import write_acceptance as write_acceptance
 from .camera_page import write_camera as write_camera
 from .certificate import check_certificate as check_certificate
 from .certificate_page import write_certificate as write_certificate
-from .change_page import write_change as write_change, write_registration as write_registration
-from .domain_page import write_domain_gap as write_domain_gap
+from .change_page import (
+    write_change as write_change,
+    write_domain_gap as write_domain_gap,
+    write_registration as write_registration,
+)
 from .findings_page import write_findings as write_findings
 from .frames import to_frame as to_frame
 from .recalibration_page import write_recalibration as write_recalibration

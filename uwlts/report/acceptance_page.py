@@ -28,8 +28,7 @@ from uwlts.pages.toolkit import (
     write_page,
 )
 
-KIND = "acceptance"
-"""Kind of the page, in the name of its JSON file."""
+KIND = "acceptance"  # kind of the page, in the name of its JSON file
 _GREEN = "#2e8b57"
 _DECISIONS = {"conformity proven": _GREEN, "accepted": _GREEN, "nonconformity proven": RED, "rejected": RED}
 """Colours of decisions; all others are open."""

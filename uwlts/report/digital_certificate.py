@@ -371,10 +371,8 @@ def _printable(text: str) -> str:
     return re.sub(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "?", text)
 
 
-_MOST_BYTES = 64 * 2**20
-"""Largest certificate; one with pictures of all its data has some megabytes."""
-_SHOWN = 5
-"""Number of places listed that a schema does not allow."""
+_MOST_BYTES = 64 * 2**20  # largest certificate; one with pictures of all its data has some megabytes
+_SHOWN = 5  # number of places listed that a schema does not allow
 
 
 def digital_certificate_lines(path: str | Path, schema: str | Path | None) -> list[str]:

@@ -38,8 +38,7 @@ from uwlts.storage.number_tables import Unit
 from uwlts.storage.pose_files import SAVED_FORMAT, PoseFormat, holds_trajectory, read_trajectory
 from uwlts.storage.truth import FORMAT as TRUTH, Truth, TruthHeader, TruthStatus, read_truth
 
-_TABLES = (".csv", ".txt", ".asc")
-"""Endings of text with a cloud or a trajectory."""
+_TABLES = (".csv", ".txt", ".asc")  # endings of text with a cloud or a trajectory
 _Stored = AnyCalibration | Mount | Evaluation | Acceptance | FigureTable
 _Readable = Capture | PointCloud | SurfaceMesh | Truth | Trajectory | _Stored
 _JSON_READERS: dict[str, Callable[[Path], _Stored]] = {

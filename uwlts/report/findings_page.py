@@ -63,16 +63,12 @@ from uwlts.storage.number_tables import Unit
 _BLEMISHES = (FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION)
 _FIRST = ("depth", "height", "remaining wall")
 """Quantities in the first columns of the table of findings."""
-_SMALLEST = 1e-6
-"""Smaller uncertainties are shown as 0."""
-_SMALLEST_MM = 0.002
-"""Precision that determines the decimals of figures without uncertainty."""
+_SMALLEST = 1e-6  # smaller uncertainties are shown as 0
+_SMALLEST_MM = 0.002  # precision that determines the decimals of figures without uncertainty
 _MOST_PICTURES = 40  # the largest findings come first
-FINDINGS = "findings"
-"""Kind of the page, in the name of its JSON file."""
+FINDINGS = "findings"  # kind of the page, in the name of its JSON file
 _MOST_DRAWN = 60_000  # points of a picture; more look the same
-_AROUND = 1.2
-"""Size of the area shown around a finding, relative to the finding."""
+_AROUND = 1.2  # size of the area shown around a finding, relative to the finding
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,7 @@ from uwlts.storage.cloud import NO_INDEX, PointCloud
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-_KEY = "key"
-"""Field that identifies a record; its own fields are columns without prefix."""
+_KEY = "key"  # field that identifies a record; its own fields are columns without prefix
 
 
 def to_frame(result: object) -> DataFrame:

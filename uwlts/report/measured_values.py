@@ -24,12 +24,10 @@ from uwlts.pages.toolkit import MISSING, format_to_scale, render_page, write_pag
 
 FORMAT = "uwlts-measured-values"
 VERSION = 1  # of the file format
-MEASURED = "measured"
-"""Kind of the files, in their names."""
+MEASURED = "measured"  # kind of the files, in their names
 MEASURED_ENDINGS = tuple(f".{MEASURED}{ending}" for ending in (".html", ".json", ".csv"))
 """Endings of page, list and table."""
-COVERAGE_FACTOR = 2.0
-"""Coverage factor of the expanded uncertainties, that of `FigureUncertainty.expanded_mm`."""
+COVERAGE_FACTOR = 2.0  # coverage factor of the expanded uncertainties, that of `FigureUncertainty.expanded_mm`
 COLUMNS = ("name", "quantity", "value / mm", "U (k = 2) / mm", "lower limit", "upper limit", "verdict", "source")
 _SHOWN_MM = 1e-4
 """Precision of values without uncertainty."""
@@ -282,8 +280,7 @@ _SIDES = np.array([4.0, 2.0, 1.0])
 usually lie, are at least 7 deg away from those at which the choice changes."""
 _ACROSS = 0.1
 """Least component of a direction along a pipe, or of 12 o'clock across it: nearer ones (6 deg) follow the noise."""
-_UPRIGHT = 0.3
-"""Component of 12 o'clock (-Z) across a pipe below which +X replaces it: pipes within 17 deg of Z."""
+_UPRIGHT = 0.3  # component of 12 o'clock (-Z) across a pipe below which +X replaces it: pipes within 17 deg of Z
 
 
 def resolve_datum(datum: FindingDatum, axis: np.ndarray) -> tuple[np.ndarray, np.ndarray, str | None]:

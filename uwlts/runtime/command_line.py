@@ -24,8 +24,7 @@ from uwlts.argument_types import union_members
 from uwlts.errors import make_printable
 from uwlts.runtime.console import SWITCHES, progress_bar, replace_by_options
 
-_LISTENERS = ("progress", "report", "warn")
-"""Parameters through which functions report; a command prints the reports."""
+_LISTENERS = ("progress", "report", "warn")  # parameters through which functions report; a command prints the reports
 
 
 class PathText(str):

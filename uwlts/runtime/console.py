@@ -26,8 +26,7 @@ SWITCHES = {
 }
 """Options of all commands, with their words and their help."""
 _TABLE_WIDTH = 110  # characters, without a terminal
-_LINE_EVERY_S = 10.0
-"""Interval between lines of progress without a terminal: a log of an hour stays readable."""
+_LINE_EVERY_S = 10.0  # interval between lines of progress without a terminal: a log of an hour stays readable
 _quiet = False
 _python_show_warning = warnings.showwarning
 

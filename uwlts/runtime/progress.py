@@ -20,8 +20,7 @@ def ignore_progress(done: int, total: int, stage: str = "") -> None:
     """Ignore the progress."""
 
 
-_AGAIN_S = 0.01
-"""Delay; callbacks of weak references take microseconds."""
+_AGAIN_S = 0.01  # delay; callbacks of weak references take microseconds
 
 
 @contextmanager

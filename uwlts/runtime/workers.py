@@ -39,13 +39,10 @@ Send = Callable[[Any], None]
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 _STARTING = threading.Lock()  # the environment belongs to all threads
 
-_GRACE_S = 5.0
-"""Time for a stopped process to clean up; afterwards its incomplete files are removed and it ends."""
-_LEAVE_S = 5.0
-"""Further time, for a busy machine, before the process is killed."""
+_GRACE_S = 5.0  # time for a stopped process to clean up; afterwards its incomplete files are removed and it ends
+_LEAVE_S = 5.0  # further time, for a busy machine, before the process is killed
 
-_WAIT_S = 0.2
-"""Interval at which the caller may end jobs."""
+_WAIT_S = 0.2  # interval at which the caller may end jobs
 
 _AHEAD = 2
 """Jobs submitted to a cluster per worker: one running and one queued, so that no worker waits for this process."""

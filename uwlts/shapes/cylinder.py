@@ -16,14 +16,10 @@ from uwlts.fitting.least_squares import (
 )
 from uwlts.shapes.flat import fit_algebraic_centres, initial_centre, prepare_round, unit_vectors
 
-_THINNED = 600
-"""Number of points for the search of a cylinder axis."""
-_NEIGHBOURS = 12
-"""Number of neighbours for a local normal."""
-_DIRECTIONS = 80
-"""Number of axis directions tried on the half sphere, about 15 deg apart."""
-_TRIED = 5
-"""Number of best directions that are refined."""
+_THINNED = 600  # number of points for the search of a cylinder axis
+_NEIGHBOURS = 12  # number of neighbours for a local normal
+_DIRECTIONS = 80  # number of axis directions tried on the half sphere, about 15 deg apart
+_TRIED = 5  # number of best directions that are refined
 _LARGEST_SLOPE_STD = 0.2
 """Largest standard uncertainty of the axis slope (11 deg); beyond, the direction is undetermined."""
 

@@ -8,14 +8,11 @@ import numpy as np
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import Normalised, fit_robustly, normalise_points, robust_std, thin_evenly
 
-_PROPOSALS = 600
-"""Random planes through three points that are tried for the largest one."""
-_JUDGING_POINTS = 3000
-"""Points, evenly thinned, that compare these planes."""
+_PROPOSALS = 600  # random planes through three points that are tried for the largest one
+_JUDGING_POINTS = 3000  # points, evenly thinned, that compare these planes
 _NEAR = 2e-3
 """Largest distance of a point from a proposed plane, as a fraction of the cloud's size; the plane is refined then."""
-_REFINEMENTS = 4
-"""Robust fits that refine the largest plane."""
+_REFINEMENTS = 4  # robust fits that refine the largest plane
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,8 +137,7 @@ def perpendicular_to(direction: np.ndarray) -> np.ndarray:
     return np.array([first, np.cross(direction, first)])
 
 
-_CIRCLE_STEPS = 20
-"""Largest number of Gauss-Newton steps to a circle; they converge in about five."""
+_CIRCLE_STEPS = 20  # largest number of Gauss-Newton steps to a circle; they converge in about five
 _LARGEST_CIRCLE = 1e6
 """Radius of a circle, relative to the extent of its points, above which they are collinear within rounding errors."""
 

@@ -10,22 +10,18 @@ from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import robust_std
 from uwlts.shapes.flat import Circle
 
-LEAST_POINTS = 12
-"""Points on the artefact that a profile needs: four for each of a circle's three parameters."""
+LEAST_POINTS = 12  # points on the artefact that a profile needs: four for each of a circle's three parameters
 _TRIALS = 400
 """Curves proposed for a profile: with a tenth of it on the artefact and neighbouring proposals, some 40 are right."""
-_REJECTED_BEYOND = 4.0
-"""Robust standard deviations; of normal noise, six points in a hundred thousand exceed it."""
-_LEAST_TOLERANCE_MM = 1e-4
-"""Smallest distance of a point from its curve; no profiler resolves less."""
+_REJECTED_BEYOND = 4.0  # robust standard deviations; of normal noise, six points in a hundred thousand exceed it
+_LEAST_TOLERANCE_MM = 1e-4  # smallest distance of a point from its curve; no profiler resolves less
 _WIDEST = 0.02
 """Largest distance of a point from its curve, relative to the profile: of an arc as wide as its radius, with noise of a
 30th of it, half of the points are still within."""
 _LARGER = 1.25
 """Largest radius of a proposed circle, relative to the sphere's: a smooth error of 2 % of the height of the shortest
 arc changes its radius by 2 %, and three single points vary more."""
-_REFINED = 5
-"""Best supported circles that are refined until one is an arc of the sphere."""
+_REFINED = 5  # best supported circles that are refined until one is an arc of the sphere
 _LEAST_ARC = np.radians(30)
 """Shorter arcs are like straight lines; their centres shift by more than the noise along the sagitta."""
 _LARGEST_GAP = 5  # largest distance of points that are beside each other, relative to the usual one

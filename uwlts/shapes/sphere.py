@@ -20,37 +20,23 @@ from uwlts.fitting.least_squares import (
 from uwlts.fitting.local_surface import number_cubes
 from uwlts.shapes.flat import fit_algebraic_centres, initial_centre, prepare_round, unit_vectors
 
-LEAST_POINTS = 50
-"""Least number of points of a sphere."""
+LEAST_POINTS = 50  # least number of points of a sphere
 
-_SEARCH_LIMIT = 0.05
-"""Half width (unit: radius) of the band of points that support a proposed sphere."""
-_LARGEST_LIMIT = 0.1
-"""Largest half width (unit: radius) of the band of a sphere's points."""
-_SMALLEST_LIMIT = 1e-4
-"""Smallest half width (unit: radius), for exact points without scatter."""
-_RADIUS_TOLERANCE = 0.1
-"""Largest relative error of a fitted radius."""
-_CELL = 0.12
-"""Size (unit: radius) of cells for the detection of other surfaces."""
-_THINNING = 1 / 15
-"""Size (unit: radius) of cells that keep one point each for the search."""
-_THINNED = 4000
-"""Number of points for scoring centres; more take longer without a benefit."""
-_SCREENED = 1000
-"""Number of points for the first screening."""
-_SEEDS = 2000
-"""Number of proposed centres."""
-_KEPT_OF_SCREENING = 150
-"""Number of centres kept by the screening."""
-_KEPT = 8
-"""Number of refined centres."""
-_ATTEMPTS = 3
-"""Number of searches, each with new random seeds."""
+_SEARCH_LIMIT = 0.05  # half width (unit: radius) of the band of points that support a proposed sphere
+_LARGEST_LIMIT = 0.1  # largest half width (unit: radius) of the band of a sphere's points
+_SMALLEST_LIMIT = 1e-4  # smallest half width (unit: radius), for exact points without scatter
+_RADIUS_TOLERANCE = 0.1  # largest relative error of a fitted radius
+_CELL = 0.12  # size (unit: radius) of cells for the detection of other surfaces
+_THINNING = 1 / 15  # size (unit: radius) of cells that keep one point each for the search
+_THINNED = 4000  # number of points for scoring centres; more take longer without a benefit
+_SCREENED = 1000  # number of points for the first screening
+_SEEDS = 2000  # number of proposed centres
+_KEPT_OF_SCREENING = 150  # number of centres kept by the screening
+_KEPT = 8  # number of refined centres
+_ATTEMPTS = 3  # number of searches, each with new random seeds
 _OUTER_SHARE = 0.1
 """Fraction of a cell's points beyond the limit that indicates another surface; for noise it is 6 in ten million."""
-_OUTER_COUNT = 2
-"""Least number of such points."""
+_OUTER_COUNT = 2  # least number of such points
 
 
 @dataclass(frozen=True, eq=False)

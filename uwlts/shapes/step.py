@@ -15,24 +15,16 @@ from uwlts.fitting.least_squares import DEFAULT_K, check_points, principal_axes,
 from uwlts.runtime.compiled import compiled
 from uwlts.shapes.flat import Line, Plane
 
-_SEARCH_LIMIT = 0.05
-"""Half width (unit: step height) of the band of points that support a proposed face."""
-_HEIGHT_TOLERANCE = 0.25
-"""Largest relative error of the described height."""
-_SMALLEST_LIMIT = 0.01
-"""Smallest half width (unit: step height) of the band of a face."""
-_LARGEST_LIMIT = 0.3
-"""Largest half width (unit: step height), so that the bands of both faces do not overlap."""
+_SEARCH_LIMIT = 0.05  # half width (unit: step height) of the band of points that support a proposed face
+_HEIGHT_TOLERANCE = 0.25  # largest relative error of the described height
+_SMALLEST_LIMIT = 0.01  # smallest half width (unit: step height) of the band of a face
+_LARGEST_LIMIT = 0.3  # largest half width (unit: step height), so that the bands of both faces do not overlap
 _LARGEST_STD = 0.125
 """Largest standard deviation of a face (unit: step height); a slope that fills the widest band has 0.17."""
-_PROPOSALS = 500
-"""Number of tested pairs (triples) of points."""
-_THINNED = 800
-"""Number of points for scoring them."""
-_SMALLEST_FACE = 0.02
-"""Least fraction of these points on a face."""
-_ROUNDS = 5
-"""Number of refinements of the best proposal."""
+_PROPOSALS = 500  # number of tested pairs (triples) of points
+_THINNED = 800  # number of points for scoring them
+_SMALLEST_FACE = 0.02  # least fraction of these points on a face
+_ROUNDS = 5  # number of refinements of the best proposal
 
 
 class StepFace(IntEnum):

@@ -13,8 +13,7 @@ from uwlts.storage.cloud import FARTHEST_SINGLE_MM, FEW_ZEROS, PointCloud, find_
 from uwlts.storage.las_file import describe_units, load_library, shorten_error
 from uwlts.storage.number_tables import Unit
 
-COLOURS = "colorRed", "colorGreen", "colorBlue"
-"""Columns of the standard for 8 bits of each colour."""
+COLOURS = "colorRed", "colorGreen", "colorBlue"  # columns of the standard for 8 bits of each colour
 
 
 def write_e57(path: Path, points_mm: np.ndarray, columns: dict[str, np.ndarray], *, to: Path) -> None:

@@ -33,8 +33,7 @@ DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError)
 _FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32, 32000, 32001, 32015}
 """Filters of a dataset's chunks: those of the program, and LZF and Zstandard, for files repacked by other tools."""
 
-_MOST_SHRINKING = 1100
-"""Largest compression ratio that is accepted: deflate reaches 1032 (zlib.net/zlib_tech.html)."""
+_MOST_SHRINKING = 1100  # largest compression ratio that is accepted: deflate reaches 1032 (zlib.net/zlib_tech.html)
 
 _LARGEST_CHUNK = 2**23
 """Largest chunk in bytes, which is read as a whole. HDF5 makes chunks of up to 1 MiB, the program smaller ones."""

@@ -24,10 +24,8 @@ from uwlts.files.reading import read_bytes
 
 SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg")
 
-MOST_PIXELS = 150_000_000
-"""Largest number of pixels of an image, that of the largest single image sensors."""
-_MOST_BYTES = 2**27
-"""Largest image file: 60 million uncompressed pixels of 16 bit."""
+MOST_PIXELS = 150_000_000  # largest number of pixels of an image, that of the largest single image sensors
+_MOST_BYTES = 2**27  # largest image file: 60 million uncompressed pixels of 16 bit
 Image.MAX_IMAGE_PIXELS = MOST_PIXELS
 # The warnings are about files that are refused, or about tags that are not read.
 warnings.filterwarnings("ignore", module="PIL")

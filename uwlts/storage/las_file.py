@@ -22,13 +22,10 @@ LAZ_STEP_M = 1e-7
 
 _REACH_M = LAZ_STEP_M * (2**31 - 1)  # of 32-bit coordinates
 _INTENSITY_LIMITS = 0, 2**16 - 1  # 16 bits
-_NOISE_CLASSES = 7, 18
-"""Low and high noise."""
-_BOX_MARGIN = 1e-3
-"""Distance of points outside the stated box that is allowed, in its longest edges."""
+_NOISE_CLASSES = 7, 18  # low and high noise
+_BOX_MARGIN = 1e-3  # distance of points outside the stated box that is allowed, in its longest edges
 _LONGEST_HEADER = 375  # bytes (LAS 1.4, table 3)
-_RECORD_BYTES = 54
-"""Smallest size of a variable length record in bytes: its header (LAS 1.4, 2.5)."""
+_RECORD_BYTES = 54  # smallest size of a variable length record in bytes: its header (LAS 1.4, 2.5)
 _LONGEST_SYSTEM = 2**20  # bytes
 _WKT = re.compile(rb"(?:COMPD_CS|COMPOUNDCRS|PROJCS|PROJCRS|GEOGCS|GEOGCRS|LOCAL_CS)\[[^\0]*")
 _COMPRESSED = 0x80  # bit of the point format

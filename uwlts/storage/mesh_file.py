@@ -31,8 +31,7 @@ READ_FORMATS = (".ply", ".stl", ".obj", ".glb")
 _Y_UP = (".glb", ".gltf")
 _TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 """Rotation from glTF's axes, whose y axis points up."""
-_LONGEST_START = 2**16
-"""Bytes in which comments are looked for."""
+_LONGEST_START = 2**16  # bytes in which comments are looked for
 _FARTHEST = 1e10
 """Largest coordinate in the file's unit: in mm the circumference of the Earth is 4e10; larger ones are damage."""
 

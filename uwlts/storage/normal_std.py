@@ -7,8 +7,7 @@ from uwlts.storage.cloud import NO_INDEX, PointCloud, PointUncertainty, project_
 _STEPS_STD = 20.0
 """Ratio of the distance between the points that give a direction and their noise: 0.07 rad of error, whose cosine
 changes the result by 0.3 %."""
-_SAMPLED = 2000
-"""Number of points for the median distance between neighbours."""
+_SAMPLED = 2000  # number of points for the median distance between neighbours
 
 
 def compute_normal_std(cloud: PointCloud) -> tuple[np.ndarray | None, np.ndarray | None]:

@@ -12,12 +12,9 @@ from numpy.typing import ArrayLike
 
 from uwlts.errors import DescriptionError
 
-_LONGEST = 18
-"""Digits of a number of 64 bits."""
-_OF_CLOCK = 6
-"""Fewest digits of a time of day (HHMMSS)."""
-_REGULAR = 0.2
-"""Largest relative deviation of regular time steps, and largest fraction of steps that exceed it."""
+_LONGEST = 18  # digits of a number of 64 bits
+_OF_CLOCK = 6  # fewest digits of a time of day (HHMMSS)
+_REGULAR = 0.2  # largest relative deviation of regular time steps, and largest fraction of steps that exceed it
 _FEWEST_STEPS = 5
 _WIDTHS = (16, 24, 32)
 """Bits of usual counters."""

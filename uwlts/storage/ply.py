@@ -14,8 +14,7 @@ from uwlts.files.reading import open_regular, shorten
 
 _LONGEST_HEADER = 2**24  # bytes; comments of some scanners are long
 _MOST_PROPERTIES = 1000  # more only occur in damaged files
-_IN_ASCII = bytes(range(128)) + b"?" * 128
-"""Comments may hold any bytes, such as names in UTF-8 or Latin-1."""
+_IN_ASCII = bytes(range(128)) + b"?" * 128  # comments may hold any bytes, such as names in UTF-8 or Latin-1
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
 _TYPES |= {"float": "f4", "double": "f8"}
 _NAMES = {code: name for name, code in _TYPES.items()}

@@ -34,8 +34,7 @@ and lever of rotations. Of independent noise along one axis, 14 % jump, in a pla
 _NEAR_HALF_TURN = 3.0
 """Angles in rad reach pi, unless turns are small; the largest in deg is between 3 and pi by chance only."""
 _MOST_POSES = 1_000_000  # more than an hour at 200 poses a second
-_LATEST_S = 1e11
-"""Unix times in s reach it in the year 5138; larger numbers are in ms, us or ns."""
+_LATEST_S = 1e11  # Unix times in s reach it in the year 5138; larger numbers are in ms, us or ns
 
 
 def read_poses(

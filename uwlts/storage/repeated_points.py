@@ -11,27 +11,19 @@ from scipy.spatial import KDTree
 
 from uwlts.storage.cloud import PointCloud
 
-_FINEST_MM = 1e-3
-"""A micrometre: finer steps of coordinates are below the uncertainty of any scanner."""
-_NO_STEP_MM = 1e-6
-"""Differences up to a nanometre come from the conversion of units."""
-_MULTIPLE = 0.01
-"""Largest difference of a gap between coordinates from a multiple of their step, in steps."""
-_STEPS = (0.5, 2.0)
-"""Radii of copies, in steps of the coordinates: only equal points, and points rounded differently."""
+_FINEST_MM = 1e-3  # a micrometre: finer steps of coordinates are below the uncertainty of any scanner
+_NO_STEP_MM = 1e-6  # differences up to a nanometre come from the conversion of units
+_MULTIPLE = 0.01  # largest difference of a gap between coordinates from a multiple of their step, in steps
+_STEPS = (0.5, 2.0)  # radii of copies, in steps of the coordinates: only equal points, and points rounded differently
 _MOVED_MM = 0.008
 """Largest radius of copies in coordinates with fine steps: copies were rounded to 0.01 mm, or moved by a micrometre."""
 _WIDER = 4.0
 """Ratio of the radius in which other points are counted to that of copies. Points of a surface have 16 times as many
 neighbours there, points of a line 4 times as many; copies have no more."""
-_FEWEST_PER_COPY = 2.0
-"""Least ratio of these numbers of neighbours for a cloud without copies: between 1 and 4."""
-_SAMPLED = 500
-"""Number of points whose neighbours are counted."""
-_FEWEST_COPIES = 5
-"""Least number of copies of the sample, that of a repeated part of 1 %: fewer may be near by chance."""
-_FEWEST = 30
-"""Least number of points: fewer do not show how often points have neighbours."""
+_FEWEST_PER_COPY = 2.0  # least ratio of these numbers of neighbours for a cloud without copies: between 1 and 4
+_SAMPLED = 500  # number of points whose neighbours are counted
+_FEWEST_COPIES = 5  # least number of copies of the sample, that of a repeated part of 1 %: fewer may be near by chance
+_FEWEST = 30  # least number of points: fewer do not show how often points have neighbours
 _LINKED = 8  # neighbours that one pass links
 
 

@@ -20,8 +20,7 @@ BLACK = 0.02
 WHITE = 0.5
 """Fraction of clipped pixels above which an image is white: lit targets and stripes clip in small regions only."""
 
-FEWEST_LINES = 20
-"""Fewest profile lines of a stripe; on single lines noise may resemble a stripe."""
+FEWEST_LINES = 20  # fewest profile lines of a stripe; on single lines noise may resemble a stripe
 
 _ACROSS_RATIO = 3
 """Ratio of lines with a stripe in both reading directions above which the stripe runs across. A stripe along the given

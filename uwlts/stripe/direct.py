@@ -18,12 +18,9 @@ import numpy as np
 from uwlts.model.stripe import Stripe, StripeCandidates, StripeStatus
 from uwlts.runtime.compiled import compiled, compiled_with_arrays
 
-_TAKEN = np.int8(1)
-"""State of a candidate on the direct stripe."""
-_OPEN = np.int8(0)
-"""State of a candidate that may be on the direct stripe."""
-_REFUSED = np.int8(-1)
-"""State of a candidate of a reflection."""
+_TAKEN = np.int8(1)  # state of a candidate on the direct stripe
+_OPEN = np.int8(0)  # state of a candidate that may be on the direct stripe
+_REFUSED = np.int8(-1)  # state of a candidate of a reflection
 
 
 @dataclass(frozen=True, kw_only=True)

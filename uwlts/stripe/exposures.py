@@ -66,8 +66,7 @@ class _Rule:
     """Distance of the background from the median, standard deviations: all but one in 16,000 background pixels."""
 
 
-_MAD_TO_STD = 1.4826
-"""Standard deviation of Gaussian noise divided by its median absolute deviation."""
+_MAD_TO_STD = 1.4826  # standard deviation of Gaussian noise divided by its median absolute deviation
 
 
 class BracketImages(Protocol):

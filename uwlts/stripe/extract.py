@@ -32,8 +32,7 @@ from uwlts.stripe.options import PeakRule, StripeOptions
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA, noise_gain
 from uwlts.stripe.search import MARGIN, SearchRules, mark_rivals, search_all, search_profiles, search_rules
 
-_NOISE_SAMPLES = 1024
-"""Number of blocks for the estimate of the noise."""
+_NOISE_SAMPLES = 1024  # number of blocks for the estimate of the noise
 
 MEDIAN_SURROUNDINGS = NormalDist().inv_cdf(1.0 - (1.0 - math.sqrt(0.5)) ** 0.5)
 """Median of max(min(a, b), min(c, d)) for unit Gaussian noise: each minimum is below x with 1 - (1 - P(x))^2."""
@@ -108,8 +107,7 @@ def _median_contrast(block: int) -> float:
 
 
 _SIZE_PX = 5  # of the window of the thesis's filter
-_SEARCHED_PX = 8
-"""Half width of the window around the stripe in which its peak is searched."""
+_SEARCHED_PX = 8  # half width of the window around the stripe in which its peak is searched
 
 
 def fit_low_passed(profiles: np.ndarray, stripe: Stripe, *, tolerance: float, fitted_px: int) -> Stripe:

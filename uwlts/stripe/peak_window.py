@@ -47,12 +47,9 @@ class WindowRule(NamedTuple):
 
 WINDOW_RULE = WindowRule()
 
-FIRST = -1
-"""Order of `SearchRules` for the rule `PeakRule.FIRST`."""
-STRONGEST = 0
-"""Order of `SearchRules` for the rules `PeakRule.STRONGEST` and `PeakRule.DIRECT`."""
-LAST = 1
-"""Order of `SearchRules` for the rule `PeakRule.LAST`."""
+FIRST = -1  # order of `SearchRules` for the rule `PeakRule.FIRST`
+STRONGEST = 0  # order of `SearchRules` for the rules `PeakRule.STRONGEST` and `PeakRule.DIRECT`
+LAST = 1  # order of `SearchRules` for the rule `PeakRule.LAST`
 
 
 class SearchRules(NamedTuple):

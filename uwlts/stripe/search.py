@@ -64,8 +64,7 @@ class _SearchRule(NamedTuple):
 
 _RULE = _SearchRule()
 
-MARGIN = 2
-"""Blocks on either side of its own block that a window covers."""
+MARGIN = 2  # blocks on either side of its own block that a window covers
 
 _OK = int(StripeStatus.OK)
 _NO_STRIPE = int(StripeStatus.NO_STRIPE)

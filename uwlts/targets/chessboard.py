@@ -115,8 +115,7 @@ _DETECTORS = {
     "OpenCV's squares": partial(_by_opencv, cv2.findChessboardCorners, _QUAD_FLAGS),
 }
 """Detectors of corners (rows, columns, 2) with NaN for missing corners; they return None if they find no board."""
-_NEARLY_WHOLE = 0.8
-"""Fraction of found corners above which no further detector is tried."""
+_NEARLY_WHOLE = 0.8  # fraction of found corners above which no further detector is tried
 
 
 def _from_top_left(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
@@ -137,8 +136,7 @@ def _from_top_left(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
     return max(turned, key=lambda each: np.nanmean(np.diff(each, axis=1)[..., 0]))
 
 
-_MIN_CORNERS = 4
-"""Fewest corners of a view: they determine a homography."""
+_MIN_CORNERS = 4  # fewest corners of a view: they determine a homography
 
 
 class CharucoTarget(Target):

@@ -18,8 +18,7 @@ Place = tuple[int, int]
 _MIN_MARK_STRENGTH = 0.3
 """Least strength of a mark above the median of all circles. This median is negative if blur lowers the ring of small
 circles. A sharp dot has strength 1, dirt and noise rarely more than 0.1, a blurred dot of two pixels 0.4."""
-_MAX_OUTLIERS = 0.02
-"""Largest fraction of circles outside the described lattice, which are outliers."""
+_MAX_OUTLIERS = 0.02  # largest fraction of circles outside the described lattice, which are outliers
 _QUARTER_TURNS = [np.array([[c, -s], [s, c]]) for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))]
 """Rotations from the target's axes to those of the indices. The target is seen from the front: no reflections."""
 
@@ -181,13 +180,9 @@ def _orientation(
     )
 
 
-if TYPE_CHECKING:
-    from uwlts.targets.detection import Lattice
-
 _FEWEST = 0.75
 """Least fraction of the circles that must be found: dirt hides single ones; with fewer, the grid is another one."""
-_MOST_OTHERS = 0.02
-"""Largest fraction of found circles outside the described grid: more are another grid."""
+_MOST_OTHERS = 0.02  # largest fraction of found circles outside the described grid: more are another grid
 
 
 class CircleGridTarget(Target):

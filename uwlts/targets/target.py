@@ -13,8 +13,7 @@ from uwlts.model.sensor import Description, NotNegative
 
 _FEWEST_POINTS = 12
 """Fewest points of a target seen in part: fewer points often do not include the marks or markers for their numbers."""
-_SMALLEST_SHARE = 0.15
-"""Least fraction of a large target's points, for the same reason."""
+_SMALLEST_SHARE = 0.15  # least fraction of a large target's points, for the same reason
 
 
 @dataclass(frozen=True)

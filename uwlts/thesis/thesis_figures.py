@@ -26,8 +26,7 @@ from uwlts.storage.capture import Capture, open_captures
 from uwlts.storage.figure_table import FigureTable, MeasuredFigure
 from uwlts.stripe import find_stripes
 
-UNIFORM = 1 / math.sqrt(3)
-"""Standard deviation of a uniform distribution divided by its half-width (GUM 4.3.7)."""
+UNIFORM = 1 / math.sqrt(3)  # standard deviation of a uniform distribution divided by its half-width (GUM 4.3.7)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,10 +195,8 @@ def window_choices(
 TEMPERATURE_HALF_WIDTH_C = 5.0  # the thesis's 5 K
 _EXPANSION_PER_K = 22.2e-6
 """Thermal expansion of the standard: the thesis's 0.011 mm for 5 K and 99.18 mm, as for aluminium."""
-_STANDARD_EXPANDED_MM = 0.004
-"""Expanded uncertainty of its calibration, k = 2 (thesis, Table 9)."""
-_SUBPIXEL = 0.1
-"""Effective resolution in px, from the thesis."""
+_STANDARD_EXPANDED_MM = 0.004  # expanded uncertainty of its calibration, k = 2 (thesis, Table 9)
+_SUBPIXEL = 0.1  # effective resolution in px, from the thesis
 
 
 def spacing_budget(
@@ -252,10 +249,8 @@ def mm_per_px(calibration: Calibration, medium_index: float) -> float:
     return float(abs(points[1, 2] - points[0, 2]))
 
 
-BUDGET = "budget of the sphere spacing"
-"""Name of the budget's figures in the column ``scan``."""
-_LOW_PASS = {"low_pass": 0.4}
-"""Settings of the thesis's stripe detection."""
+BUDGET = "budget of the sphere spacing"  # name of the budget's figures in the column ``scan``
+_LOW_PASS = {"low_pass": 0.4}  # settings of the thesis's stripe detection
 
 
 def evaluate_thesis(

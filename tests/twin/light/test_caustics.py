@@ -8,7 +8,7 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 
 from tests.virtual_sensors import altered, clear, plate, scene_of, sensor_at
-from twin.light.caustics import CELLS, PATCH_MM, Caustics, angular_frequency, focus_light, slope_variance_per_octave
+from twin.light.illumination import CELLS, PATCH_MM, Caustics, angular_frequency, focus_light, slope_variance_per_octave
 from twin.light.renderer import Renderer
 from twin.recording.sensor_simulator import SensorSimulator
 from twin.rendering_options import NONE, Flaws, Options

@@ -12,7 +12,7 @@ from tests.virtual_sensors import clear, oracle_paths, scene_of, sensor_at
 from twin.backend.arrays import to_jit, to_numpy
 from twin.light.renderer import Renderer
 from twin.recording.frame_truth import find_true_stripe
-from twin.scene.forms.weld import Weld, weld_height
+from twin.scene.forms.flawed_parts import Weld, weld_height
 from twin.scene.objects import Objects, build_objects
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.storage.truth import TruthStatus

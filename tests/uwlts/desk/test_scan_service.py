@@ -17,7 +17,7 @@ from tests.waiting import within
 from twin.devices.grbl_controller import GrblController
 from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
-from uwlts.desk import ros_node
+from uwlts.desk import scan
 from uwlts.desk.scan import ScanService
 from uwlts.errors import CalibrationError, HardwareError
 from uwlts.hardware.grbl import GrblStage
@@ -192,7 +192,7 @@ def test_a_node_of_ros_that_is_interrupted_ends_as_interrupted(capture: Path, ca
         init=lambda: done.append("init"), try_shutdown=lambda: done.append("end"), spin=spin, create_node=lambda _: node
     )
     modules = rclpy, SimpleNamespace(ExternalShutdownException=Ended), Mock(), Mock(), Mock(), Mock()
-    monkeypatch.setattr(ros_node, "_import_ros", lambda: modules)
+    monkeypatch.setattr(scan, "_import_ros", lambda: modules)
     with pytest.raises(KeyboardInterrupt):
-        ros_node.serve_ros(capture, calibration=calibration)
+        scan.serve_ros(capture, calibration=calibration)
     assert done == ["init", "end"]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from uwlts.desk.ros_node import StampedClouds
+from uwlts.desk.scan import StampedClouds
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
 from uwlts.storage.point_cloud2 import bag_types
 

@@ -22,19 +22,15 @@ from uwlts.model.sensor import Camera, Medium, Sensor, Window
 from uwlts.optics.design import Lens, WindowGeometry, trace_rays, undistort_pixels
 from uwlts.pages.toolkit import BLUE, INK, RED, SOFT, new_figure
 
-_BEYOND = 1.06
-"""Length of drawn rays and sheet relative to the distance of the volume's far end."""
-_DEPTHS = 201
-"""Depths at which the region that both camera and laser reach is searched."""
-_PLACES = 21
-"""Points along the stripe at each depth."""
+_BEYOND = 1.06  # length of drawn rays and sheet relative to the distance of the volume's far end
+_DEPTHS = 201  # depths at which the region that both camera and laser reach is searched
+_PLACES = 21  # points along the stripe at each depth
 # The description does not contain the housing: these sizes only indicate it.
 _HOUSING_MM = 42.0
 _WALL_MM = 5.0
 _BARE_FRONT_MM = 12.0
 """Distance of the housing's front from the pupil without a window."""
-_BARE_HALF_MM = 15.0
-"""Half the width of the front without a window."""
+_BARE_HALF_MM = 15.0  # half the width of the front without a window
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,12 +217,9 @@ _HOUSING = "#aab4c0"
 _VOLUME = "#f1ecd9"
 _VOLUME_END = "#bda96b"
 _INCHES = (7.5, 7.0)  # width and height
-_MARGIN = 0.1
-"""Margin around a view for dimensions, relative to its larger side."""
-_LABELS = 0.35
-"""Margin at the right for labels, relative to the width."""
-_ARC = 0.4
-"""Radius of the arc at the triangulation angle, relative to the stand-off from the window."""
+_MARGIN = 0.1  # margin around a view for dimensions, relative to its larger side
+_LABELS = 0.35  # margin at the right for labels, relative to the width
+_ARC = 0.4  # radius of the arc at the triangulation angle, relative to the stand-off from the window
 
 
 def draw(view: SideView, other: SideView | None = None) -> Figure:

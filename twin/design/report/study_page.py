@@ -34,11 +34,9 @@ from uwlts.pages.toolkit import (
     render_page,
 )
 
-Interactive = tuple[go.Figure, str]
-"""Figure for a page, and its caption."""
+Interactive = tuple[go.Figure, str]  # figure for a page, and its caption
 
-_SYMBOLS = ("diamond", "circle", "star", "square", "cross")
-"""Symbols of highlighted designs."""
+_SYMBOLS = ("diamond", "circle", "star", "square", "cross")  # symbols of highlighted designs
 _SHOWN = (
     "sigma_z_rms_mm",
     "sigma_z_mm",
@@ -60,10 +58,8 @@ MOST_POINTS = 20_000
 _MOST_IN_PANEL = 2_000
 _IN_SVG = 2500
 """Above this number, points are drawn with WebGL, which is faster."""
-_WIDE_RANGE = 30.0
-"""Ratio of the largest to the smallest value above which a figure has a logarithmic axis or colours."""
-_escaped = partial(escape, quote=False)
-"""Escape text for plotly."""
+_WIDE_RANGE = 30.0  # ratio of the largest to the smallest value above which a figure has a logarithmic axis or colours
+_escaped = partial(escape, quote=False)  # escape text for plotly
 
 
 def shown_figures(judged: StudyResults) -> list[str]:
@@ -265,8 +261,7 @@ def sample(candidates: np.ndarray, kept: np.ndarray, most: int) -> np.ndarray:
     return chosen
 
 
-_BEST = 20
-"""Designs in the table of the best."""
+_BEST = 20  # designs in the table of the best
 _DRAWN = (
     "Along the sheet, lengths in mm; near, far and stand-off are measured from the window. The camera's view is blue, "
     "the sheet red (thick: in the camera's view and in the tinted measuring volume). Windows and rays are to scale; "

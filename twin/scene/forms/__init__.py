@@ -4,10 +4,9 @@ A new form is a module with its description, formula and triangles, and an entry
 """
 
 from twin.scene.forms.flange import Flange
+from twin.scene.forms.flawed_parts import PittedPipe, Weld
 from twin.scene.forms.head import Head
-from twin.scene.forms.pitted_pipe import PittedPipe
 from twin.scene.forms.seabed import Seabed
-from twin.scene.forms.weld import Weld
 
 AnyForm = Flange | Head | PittedPipe | Seabed | Weld
 

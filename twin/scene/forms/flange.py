@@ -11,10 +11,8 @@ from twin.scene.forms.triangles import chord_step, quads, require_few_vertices
 from twin.scene.scene_object import FreeForm
 from uwlts.model.sensor import NotNegative, Positive
 
-_SAG_MM = 0.004
-"""Largest distance of the facets from the round edges and the face."""
-_EMBEDDED_MM = 0.5
-"""Depth of bolt heads below the face, which may be uneven there; also the smallest `thickness_mm`."""
+_SAG_MM = 0.004  # largest distance of the facets from the round edges and the face
+_EMBEDDED_MM = 0.5  # depth of bolt heads below the face, which may be uneven there; also the smallest `thickness_mm`
 
 
 class Flange(FreeForm):

@@ -38,10 +38,8 @@ _FEATURES = np.array(
 )
 _ROWS = 900
 """Number of rows of facets from crown to neck."""
-_COLUMNS = 640
-"""Number of facets around the head."""
-_FINER_IN_FRONT = 0.45
-"""Relative refinement of the facets on the face."""
+_COLUMNS = 640  # number of facets around the head
+_FINER_IN_FRONT = 0.45  # relative refinement of the facets on the face
 
 
 class Head(FreeForm):

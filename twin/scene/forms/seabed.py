@@ -9,12 +9,9 @@ from twin.scene.forms.triangles import chord_step, grid_faces, require_few_verti
 from twin.scene.scene_object import FreeForm
 from uwlts.model.sensor import NotNegative, Positive
 
-_SAG_MM = 0.02
-"""Largest distance of the sediment's facets from the surface; twice as much for stones."""
-_SHORTEST = 0.2
-"""Shortest wavelength of the roughness, divided by the ripples' pitch."""
-_LONGEST = 1.0
-"""Longest wavelength, divided by the ripples' pitch."""
+_SAG_MM = 0.02  # largest distance of the sediment's facets from the surface; twice as much for stones
+_SHORTEST = 0.2  # shortest wavelength of the roughness, divided by the ripples' pitch
+_LONGEST = 1.0  # longest wavelength, divided by the ripples' pitch
 
 
 class Seabed(FreeForm):

@@ -12,8 +12,7 @@ from uwlts.model.calibration import CameraModel
 from uwlts.model.parameter_keys import LensParameter
 from uwlts.model.sensor import Camera, Distortion
 
-DISTORTION = tuple(Distortion.model_fields)
-"""Names of the coefficients in OpenCV's order."""
+DISTORTION = tuple(Distortion.model_fields)  # names of the coefficients in OpenCV's order
 
 
 @dataclass(frozen=True)

@@ -41,8 +41,7 @@ _FINEST_PX = 0.05
 """Scatter of a coordinate below which points and images are not distinguished. Blur, light and print differ between
 good images by a few hundredths of a pixel; false points are off by much more. Chosen by hand, not fitted to data."""
 _MOVED = 3.0  # standard uncertainties by which one image may change a parameter
-HALVES_APART = 4.0
-"""Largest difference of a parameter between two halves of the images, in its standard uncertainties."""
+HALVES_APART = 4.0  # largest difference of a parameter between two halves of the images, in its standard uncertainties
 _FEWEST_IMAGES = 5  # images that must remain: with fewer, the influence of one image is uncertain
 _LARGEST_LEFT_OUT = 0.2  # fraction of the images: if more change a parameter, it is unclear which are right
 

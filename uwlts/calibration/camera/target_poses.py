@@ -411,8 +411,7 @@ def stage_direction(target_poses: np.ndarray, stage_mm: np.ndarray) -> np.ndarra
 
 _LEAST_TURN = np.radians(20)
 """Angle between a direction and its description above which images may be rotated: descriptions are rough."""
-_MUCH_CLOSER = 1 / 3
-"""Fraction of that angle within which a direction must agree with rotated images."""
+_MUCH_CLOSER = 1 / 3  # fraction of that angle within which a direction must agree with rotated images
 _TURNS = {
     "turned by 180 deg": np.array([-1.0, -1.0, 1.0]),
     "mirrored top to bottom": np.array([1.0, -1.0, 1.0]),

@@ -340,8 +340,7 @@ class CandidatePose(Candidate):
     pixels: np.ndarray
 
 
-PoseAdvice = Forecast[CandidatePose]
-"""Expected effect of a pose on `compute_shortfall`."""
+PoseAdvice = Forecast[CandidatePose]  # expected effect of a pose on `compute_shortfall`
 
 
 def candidates(state: State, *, spin_rad: float = 0.0) -> list[CandidatePose]:

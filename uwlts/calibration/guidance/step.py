@@ -16,8 +16,7 @@ from uwlts.optics.triangulation import points_on_sheet
 from uwlts.stripe import StripeStatus, extract_stripe
 from uwlts.stripe.capture_stripes import FEWEST_LINES
 
-PLACES = 3
-"""Number of depths of the standard that are needed: near, middle and far."""
+PLACES = 3  # number of depths of the standard that are needed: near, middle and far
 _APART = 1 / 7  # fraction of the volume's depth
 _MOST_SATURATED = 0.05  # fraction of the lines; outlier tests tolerate this many wrong centres
 

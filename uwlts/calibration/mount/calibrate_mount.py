@@ -43,12 +43,10 @@ from uwlts.storage.pose_files import PoseFormat, read_poses
 
 _MOST_POINTS = 100_000
 """Points of all profiles together; more take time without lower uncertainty, as pose errors dominate."""
-_NO_FIT = 0.1
-"""Pose error divided by the sphere's radius that no platform has; a wrong pose format exceeds it."""
+_NO_FIT = 0.1  # pose error divided by the sphere's radius that no platform has; a wrong pose format exceeds it
 _OTHER_SIZE = 0.03
 """Relative difference from the given radius that proves another radius: scale errors of profilers are smaller."""
-_SURE = 5.0
-"""The same in standard uncertainties (one in a million for normal errors); the larger limit applies."""
+_SURE = 5.0  # the same in standard uncertainties (one in a million for normal errors); the larger limit applies
 
 
 def calibrate_mount(

@@ -39,12 +39,9 @@ from uwlts.targets import Target, parse_target
 
 FEWEST_IMAGES = 4
 """Three poses with rotations about two axes determine the mount; a fourth one shows whether they agree."""
-_LEAST_PX = 1e-3
-"""Lower bound of the detection error of a corner or circle."""
-POSE_STEPS = np.array([1e-3] * 3 + [1e-6] * 3)
-"""Step sizes of shift (mm) and rotation (rad) for finite differences."""
-_NO_FIT = 0.1
-"""Pose error divided by the extent of the target that no platform has; a wrong pose format exceeds it."""
+_LEAST_PX = 1e-3  # lower bound of the detection error of a corner or circle
+POSE_STEPS = np.array([1e-3] * 3 + [1e-6] * 3)  # step sizes of shift (mm) and rotation (rad) for finite differences
+_NO_FIT = 0.1  # pose error divided by the extent of the target that no platform has; a wrong pose format exceeds it
 _TRIPLES = 100
 """Random triples of images: with a third of the images wrong, all triples contain a wrong one once in 10^15 runs."""
 _BOUNDS = np.array([(1.0, 100.0), (1e-4, 1e3), (1e-7, 1.0)])
@@ -267,8 +264,7 @@ def move_about(pose: np.ndarray, middle: np.ndarray, step: np.ndarray) -> np.nda
     return rigid_transform(rotation, place - rotation @ middle)
 
 
-_State = tuple[np.ndarray, np.ndarray]
-"""``T_platform_sensor`` and ``T_base_target``, (4, 4) each."""
+_State = tuple[np.ndarray, np.ndarray]  # ``T_platform_sensor`` and ``T_base_target``, (4, 4) each
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,20 +14,15 @@ from uwlts.fitting.next_observation import Candidate, CovarianceRoot, rank_candi
 from uwlts.model.calibration import rigid_transform
 from uwlts.model.mount import NextPose
 
-_TURN_RAD = np.radians(30)
-"""Rotation that a robot easily makes with the artefact in view."""
-_LEAST_TURN_RAD = np.radians(5.0)
-"""RMS rotation about an axis below which a warning is given."""
+_TURN_RAD = np.radians(30)  # rotation that a robot easily makes with the artefact in view
+_LEAST_TURN_RAD = np.radians(5.0)  # RMS rotation about an axis below which a warning is given
 _OPEN_MM = 5.0  # standard uncertainty of a shift that counts as not determined: a ruler is better
-OPEN_RAD = np.radians(1.0)
-"""Standard uncertainty of a rotation that counts as not determined: a protractor is better."""
+OPEN_RAD = np.radians(1.0)  # standard uncertainty of a rotation that counts as not determined: a protractor is better
 _WEAK = 5.0  # ratio to the uncertainty of the best determined direction above which a further pose is advised
 _LEAST_MM = 0.01  # standard uncertainty of a shift below which no further pose is advised
 _LEAST_RAD = np.radians(0.005)  # the same for a rotation: 0.02 mm at 220 mm
-_POINTS = 100
-"""Points of a simulated profile; more points are redundant."""
-_UNKNOWN_MM = 100.0
-"""Prior standard uncertainty of the mount's shift, so that undetermined directions can be compared."""
+_POINTS = 100  # points of a simulated profile; more points are redundant
+_UNKNOWN_MM = 100.0  # prior standard uncertainty of the mount's shift, so that undetermined directions can be compared
 _UNKNOWN_RAD = 0.5  # the same for its rotation
 
 

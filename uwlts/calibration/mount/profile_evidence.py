@@ -131,14 +131,10 @@ _TIME_STEP_S = 1e-4  # for derivatives: short beside any acceleration of a platf
 _POINT_MM = (1e-5, 1e2)
 """Bounds of scatter in mm: far below any profiler's resolution, and far above any platform's error."""
 _TURN_RAD = (1e-8, 1.0)  # the same for rotations
-_ROUNDING = 1e-12
-"""Fraction of the largest variance, above rounding errors that would make covariances singular."""
-_BINS = 32
-"""Bins of a profile, whose points are averaged: a smooth error that changes within a bin acts like noise."""
-_LEAST_SPAN = 1e-6
-"""Fraction of the largest effect of a pose error on its profile below which an effect is ignored."""
-_LEAST_SHARE = 1e-3
-"""Least factor on the noise of a plane's points, reached at a tilt of 0.06 deg from the sheet."""
+_ROUNDING = 1e-12  # fraction of the largest variance, above rounding errors that would make covariances singular
+_BINS = 32  # bins of a profile, whose points are averaged: a smooth error that changes within a bin acts like noise
+_LEAST_SPAN = 1e-6  # fraction of the largest effect of a pose error on its profile below which an effect is ignored
+_LEAST_SHARE = 1e-3  # least factor on the noise of a plane's points, reached at a tilt of 0.06 deg from the sheet
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,10 +12,8 @@ from scipy.stats import f, t
 
 from uwlts.errors import CalibrationError
 
-_FALSE_ALARM = 1e-3
-"""Probability that any pose of a campaign without wrong poses is rejected, for normal errors."""
-LARGEST_ROUGH = 6.0
-"""Multiple of the median misfit of a pose: of 45 normal poses, one in millions exceeds it."""
+_FALSE_ALARM = 1e-3  # probability that any pose of a campaign without wrong poses is rejected, for normal errors
+LARGEST_ROUGH = 6.0  # multiple of the median misfit of a pose: of 45 normal poses, one in millions exceeds it
 _SETTLED = 0.01
 """Last step in standard uncertainties, and last change of the likelihood, too small to change any stated figure."""
 _SHRINKING = 0.7
@@ -24,10 +22,8 @@ _MOST_ROUNDS = 60
 """Rounds after which an estimate has not converged: four halvings of the step, and ten rounds for each."""
 _SPELL = 10
 """Rounds in which the steps must halve, or the estimate will not converge: 60 rounds make them 64 times smaller."""
-_LEAST_FRACTION = 1 / 16
-"""Smallest fraction of a step: it damps steps that overshoot up to 30-fold."""
-_LEAST_EIGENVALUE = 1e-13
-"""Smallest eigenvalue of information with a unit diagonal: below it, rounding errors dominate."""
+_LEAST_FRACTION = 1 / 16  # smallest fraction of a step: it damps steps that overshoot up to 30-fold
+_LEAST_EIGENVALUE = 1e-13  # smallest eigenvalue of information with a unit diagonal: below it, rounding errors dominate
 
 
 State = TypeVar("State")

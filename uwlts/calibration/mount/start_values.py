@@ -13,12 +13,10 @@ from uwlts.shapes.profile_curves import Detection, ProfileArc, ProfileLine
 _SUBSET = 8  # poses of a random subset: 24 linear equations for 12 unknowns
 _SUBSETS = 40  # random subsets: with a fifth of the poses wrong, one of six subsets contains no wrong pose
 _TRIED = 4  # best linear solutions for a sphere, which are refined
-_THINNED = 9
-"""Points of each profile in the refinement of start values."""
+_THINNED = 9  # points of each profile in the refinement of start values
 _TURNS = 5000  # rotations tried for a plane, some 12 deg apart
 _TURNS_TRIED = 10  # best rotations, which are refined
-_RADII = (1.02, 1.15, 1.5)
-"""Trial radii of an unknown sphere, relative to its largest section."""
+_RADII = (1.02, 1.15, 1.5)  # trial radii of an unknown sphere, relative to its largest section
 _REWEIGHTED = 10  # rounds of Cauchy weights; a start needs no more digits
 _ROUGH = Scatter(point_mm=0.1, smooth_mm=1e-4, length_mm=1.0, pose_mm=0.3, turn_rad=3e-3)
 """Scatter for the weights of the search; beyond it the loss is robust."""

@@ -18,8 +18,7 @@ import numpy as np
 from uwlts.runtime.compiled import compiled
 from uwlts.stripe.peak_window import WINDOW_RULE, PeakWindow, exponential
 
-_ONE_PIXEL = 0.3
-"""Sigma, px, of light within one pixel (1 / sqrt 12, rounded), the narrowest stripe in an image."""
+_ONE_PIXEL = 0.3  # sigma, px, of light within one pixel (1 / sqrt 12, rounded), the narrowest stripe in an image
 
 
 @lru_cache

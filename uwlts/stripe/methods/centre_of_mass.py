@@ -9,8 +9,7 @@ import numpy as np
 from uwlts.runtime.compiled import compiled
 from uwlts.stripe.peak_window import CONVERGED_PX, PeakWindow, covered_fraction
 
-_ITERATIONS = 6
-"""Most updates of the window's position."""
+_ITERATIONS = 6  # most updates of the window's position
 
 _HALF_SIGMAS = 2.25
 """Half width of the window, sigmas: it contains most of the light; further pixels add more noise than light."""

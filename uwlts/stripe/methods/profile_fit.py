@@ -16,30 +16,24 @@ from uwlts.stripe.line_scatter import least_scattered
 from uwlts.stripe.methods import centre_of_mass, quadratic, zero_crossing
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA, WINDOW_RULE, PeakWindow, exponential
 
-_STEPS = 5
-"""Number of steps of the fit, equal for all lines, which are fitted in parallel."""
+_STEPS = 5  # number of steps of the fit, equal for all lines, which are fitted in parallel
 
-_FIRST_STEPS = 2
-"""Number of steps before the contrast is estimated from the residuals."""
+_FIRST_STEPS = 2  # number of steps before the contrast is estimated from the residuals
 
 _UNMODELLED = 0.02
 """Deviation of a stripe from a Gaussian by haze, flare and blur, as a fraction of its height. It limits the weight of
 the wings, from 2.5 sigma on for a contrast of one half."""
 
-_LEAST_NOISE = 0.5
-"""Least noise, grey levels: values are rounded to integers and clipped at black."""
+_LEAST_NOISE = 0.5  # least noise, grey levels: values are rounded to integers and clipped at black
 
 _USUAL_CONTRAST = 0.3
 """Speckle contrast assumed for the first steps; fully developed speckle resolved by the pixels has contrast 1."""
 
-_PRIOR_PIXELS = 5.0
-"""Weight of the assumed contrast as a number of pixels: fewer than one stripe has."""
+_PRIOR_PIXELS = 5.0  # weight of the assumed contrast as a number of pixels: fewer than one stripe has
 
-_NARROWEST = 0.4
-"""Least sigma, px; a stripe within one pixel has 0.29."""
+_NARROWEST = 0.4  # least sigma, px; a stripe within one pixel has 0.29
 
-_WIDENING = 1.5
-"""Largest ratio of the fitted sigma and the sigma from the half-height width."""
+_WIDENING = 1.5  # largest ratio of the fitted sigma and the sigma from the half-height width
 
 _LONGEST_STEP = 0.5
 """Largest change per step of the logarithms of height and width, and of the centre in sigmas: the linearised model is
@@ -52,50 +46,33 @@ _NEARLY = 0.03
 """Fraction of a stripe's height by which noise and compression lower the pixels of a plateau. A Gaussian is as high
 over a fifth of its width only."""
 
-_MOSTLY = 0.5
-"""Fraction of the width above which a plateau is most of its stripe."""
+_MOSTLY = 0.5  # fraction of the width above which a plateau is most of its stripe
 
-_PLATEAU = 5
-"""Fewest pixels of a plateau, and of the width of its stripe."""
+_PLATEAU = 5  # fewest pixels of a plateau, and of the width of its stripe
 
-_SAMPLED = 256
-"""Number of lines for the estimates of noise and contrast; more lines would not improve the fit."""
+_SAMPLED = 256  # number of lines for the estimates of noise and contrast; more lines would not improve the fit
 
-_LANES = 16
-"""Number of lines fitted in parallel, which fills the processor's vector units."""
+_LANES = 16  # number of lines fitted in parallel, which fills the processor's vector units
 
-_KNOWN = 8
-"""Number of rows of lanes with parameters of the lines, from `_CENTRE` to `_REACH`."""
+_KNOWN = 8  # number of rows of lanes with parameters of the lines, from `_CENTRE` to `_REACH`
 _CENTRE = 0 * _LANES
 _HEIGHT = 1 * _LANES
 _SIGMA = 2 * _LANES
 _FIRST = 3 * _LANES
 """Least centre."""
-_LAST = 4 * _LANES
-"""Largest centre."""
-_WIDEST = 5 * _LANES
-"""Largest sigma."""
-_FLOOR = 6 * _LANES
-"""Floor of the variance."""
-_REACH = 7 * _LANES
-"""Pixels on either side."""
+_LAST = 4 * _LANES  # largest centre
+_WIDEST = 5 * _LANES  # largest sigma
+_FLOOR = 6 * _LANES  # floor of the variance
+_REACH = 7 * _LANES  # pixels on either side
 
-_SUMS = 15
-"""Number of rows of lanes with sums: eight moments, then the rows from `_AFTER` to `_FLATNESS`."""
-_AFTER = 8 * _LANES
-"""Model at the pixel after the middle."""
-_BEFORE = 9 * _LANES
-"""Model at the pixel before the middle."""
-_RISE_AFTER = 10 * _LANES
-"""Ratio of the model at the next pixel after."""
-_RISE_BEFORE = 11 * _LANES
-"""Ratio of the model at the next pixel before."""
-_FALLING = 12 * _LANES
-"""Factor of these ratios per pixel."""
-_INVERSE = 13 * _LANES
-"""Inverse of sigma."""
-_FLATNESS = 14 * _LANES
-"""Fourth cumulant of the pixel, divided by 24 sigma^4."""
+_SUMS = 15  # number of rows of lanes with sums: eight moments, then the rows from `_AFTER` to `_FLATNESS`
+_AFTER = 8 * _LANES  # model at the pixel after the middle
+_BEFORE = 9 * _LANES  # model at the pixel before the middle
+_RISE_AFTER = 10 * _LANES  # ratio of the model at the next pixel after
+_RISE_BEFORE = 11 * _LANES  # ratio of the model at the next pixel before
+_FALLING = 12 * _LANES  # factor of these ratios per pixel
+_INVERSE = 13 * _LANES  # inverse of sigma
+_FLATNESS = 14 * _LANES  # fourth cumulant of the pixel, divided by 24 sigma^4
 
 _PIXEL_CUMULANT = -1.0 / 120.0
 """Fourth cumulant of the light sensitivity of a square pixel, px^4. Its second one, 1 / 12, belongs to sigma."""

@@ -9,8 +9,7 @@ import numpy as np
 from uwlts.runtime.compiled import compiled
 from uwlts.stripe.peak_window import CONVERGED_PX, FWHM_PER_SIGMA, PeakWindow, covered_fraction
 
-_ITERATIONS = 6
-"""Most fits, each about the vertex of the previous one."""
+_ITERATIONS = 6  # most fits, each about the vertex of the previous one
 
 
 def centres(peak: PeakWindow) -> np.ndarray:

@@ -232,8 +232,7 @@ def sample_levels(grey: np.ndarray, places: np.ndarray) -> np.ndarray:
     return upper * (1 - dy) + (grey[row + 1, column] * (1 - dx) + grey[row + 1, column + 1] * dx) * dy
 
 
-HALF_WINDOW = 5
-"""Half side of the window for a corner's quality, px."""
+HALF_WINDOW = 5  # half side of the window for a corner's quality, px
 
 
 def convert_to_eight_bit(image):

@@ -11,10 +11,8 @@ from uwlts.errors import RangeError
 from uwlts.runtime.compiled import compiled, compiled_part, compiled_with_arrays
 from uwlts.targets.detection.blobs import Blobs, check_grey, estimate_noise, find_blobs
 
-PROFILES = 48
-"""Edge profiles around a blob."""
-SAMPLES = 11
-"""Samples on each edge profile."""
+PROFILES = 48  # edge profiles around a blob
+SAMPLES = 11  # samples on each edge profile
 
 
 class EllipseRule(NamedTuple):
@@ -424,8 +422,7 @@ def measure_marks(image, circles, *, mark_over_circle):
     return (ring - dot) / circles.contrast * (1.0 if circles.bright else -1.0)
 
 
-RIM_POINTS = 16
-"""Projected points on the rim of a circle."""
+RIM_POINTS = 16  # projected points on the rim of a circle
 
 
 def circle_centre_bias(project, centres_mm, *, diameter_mm, axis_u, axis_v):

@@ -8,8 +8,7 @@ from scipy.spatial import KDTree
 from uwlts.errors import TargetError
 from uwlts.targets.detection.ellipses import Ellipses, find_circles
 
-STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))
-"""Steps to the neighbours of a place in a lattice."""
+STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))  # steps to the neighbours of a place in a lattice
 
 
 @dataclass(frozen=True, kw_only=True)
