@@ -282,7 +282,10 @@ def check(seed: int, folder: Path, calibration: uwlts.Calibration, fault: str) -
         poses[:, :3, 3] /= 1.001
     if fault == "mirrored":
         mirrored = folder / f"{seed}-mirrored.h5"
-        with open_capture(captures[1]) as plain, CaptureWriter(mirrored, plain.header, dtype=np.uint8) as writer:
+        with (
+            open_capture(captures[1]) as plain,
+            CaptureWriter(mirrored, plain.header, dtype=np.dtype(np.uint8)) as writer,
+        ):
             for frame in map(plain.__getitem__, range(len(plain))):
                 writer.append(replace(frame, seen=np.ascontiguousarray(frame.image[:, ::-1])))
         captures[1] = mirrored

@@ -114,6 +114,8 @@ class Recalibrated(Brief):
 
     Attributes
     ----------
+    passes : tuple of str
+        Names of the captures.
     calibration : Calibration
         The moved calibration with its new covariance.
     lengths : tuple of StatedLength
@@ -130,6 +132,7 @@ class Recalibrated(Brief):
         Doubts about single passes, as by `reconstruct`.
     """
 
+    passes: tuple[str, ...]
     calibration: Calibration
     lengths: tuple[StatedLength, ...]
     parameters: tuple[ParameterChange, ...]
@@ -372,6 +375,7 @@ def summarise(
         )
     )
     return Recalibrated(
+        tuple(each.name for each in problem.passes),
         _build(problem, solution, moved, of_parameters, prior, described),
         lengths,
         changes,

@@ -37,13 +37,12 @@ def write_recalibration(
     OutputError
         A file exists and ``overwrite`` is not given, or cannot be written.
     """
-    passes = found.calibration.provenance["recalibrated"]["passes"]
-    most = surface_limit_mm(found.parts_before.apart_mm)
+    count, most = len(found.passes), surface_limit_mm(found.parts_before.apart_mm)
     text = render_page(
         "uwlts.report",
         "recalibration.html.j2",
         title=title,
-        passes=", ".join(passes),
+        passes=", ".join(found.passes),
         lengths=[
             Tile(f"100 mm along {each.axis}", f"+-{each.after_mm:.3f} mm", f"before: +-{each.before_mm:.3f} mm")
             for each in found.lengths
@@ -56,7 +55,7 @@ def write_recalibration(
             for each in found.next_passes[:6]
             if each.after < each.before
         ],
-        overlap=_draw(found.parts, found.parts.passes, "passes", most=len(passes), ticks=range(1, len(passes) + 1)),
+        overlap=_draw(found.parts, found.parts.passes, "passes", most=count, ticks=range(1, count + 1)),
         before=_draw(found.parts_before, found.parts_before.apart_mm, "distance / mm", most=most),
         after=_draw(found.parts, found.parts.apart_mm, "distance / mm", most=most),
         spread=f"{found.spread:.2f}",
