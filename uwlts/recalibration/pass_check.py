@@ -60,32 +60,37 @@ class PassCheck:
 
 
 def split_passes(cloud: PointCloud) -> np.ndarray:
-    """Return the pass (N,) of each point: a pass ends where the images' motion turns by more than 90 deg."""
+    """Return the pass (N,) of each point: a pass ends where the images' motion turns by more than 90 deg.
+
+    Images about a turn belong to no pass, -1, so that the end of a pass is no overlap with the next one.
+    """
     image, of_point = np.unique(cloud.frame, return_inverse=True)
     sums = [np.bincount(of_point, axis) for axis in cloud.points_mm.T]
     place = np.stack(sums, axis=1) / np.bincount(of_point)[:, None]
     number = np.zeros(len(image), int)
     if len(image) > _SMOOTHED:
         way = np.gradient(uniform_filter1d(place, _SMOOTHED, axis=0), axis=0)
-        reference = 0
+        reference, turns = 0, []
         for each in range(1, len(image)):
-            turned = each > reference and way[each] @ way[reference] < 0
-            if turned:
+            if each > reference and way[each] @ way[reference] < 0:
+                turns.append(each)
                 # The turn itself has no direction.
                 reference = min(each + _SMOOTHED, len(image) - 1)
-            number[each] = number[each - 1] + turned
+        number = np.searchsorted(turns, np.arange(len(image)), side="right")
+        for each in turns:
+            number[max(0, each - _SMOOTHED // 2) : each + _SMOOTHED // 2] = -1
     return number[of_point]
 
 
 def check_passes(cloud: PointCloud) -> PassCheck | None:
-    """Return the agreement of a cloud's passes; None without their overlap, or without the cloud's uncertainty."""
-    if cloud.uncertainty is None:
+    """Return the agreement of a platform's passes; None without their overlap, or without the cloud's uncertainty."""
+    if cloud.uncertainty is None or cloud.time_s is None:
         return None
     number = split_passes(cloud)
-    chosen = np.flatnonzero(cloud.line % _LINES == 0)
+    chosen = np.flatnonzero((cloud.line % _LINES == 0) & (number >= 0))
     chosen = chosen[:: max(1, len(chosen) // _MOST_POINTS)]
     number, known, places = number[chosen], cloud.uncertainty[chosen], cloud.points_mm[chosen]
-    if number.max(initial=0) == 0:
+    if len(np.unique(number)) < 2:
         return None
     points = PassPoints(
         places,
