@@ -130,7 +130,7 @@ def _find_cause(cloud: PointCloud, amplitudes: np.ndarray, covariance: np.ndarra
     words = {"sensor": "the calibration", "mount": "the mount"}
     shared = cloud.uncertainty.shared
     groups = {words.get(name.split()[0], "the water's index"): by for name, by in shared.items()}
-    alone = np.all([~by.any(axis=1) for by in shared.values()], axis=0)
+    alone = ~np.any([np.zeros(len(amplitudes), bool), *(by.any(axis=1) for by in shared.values())], axis=0)
     groups["the poses"] = np.eye(len(amplitudes))[:, alone]
     chances = {}
     for name, by in groups.items():
