@@ -314,8 +314,7 @@ class _Evidence:
         self, whole: np.ndarray, others: Sequence[_Evidence], attenuation_per_m: float | None = None
     ) -> np.ndarray:
         """Return the mean square of the changes of the estimates ``whole`` with other phase functions."""
-        every = np.ones(BLOCKS, bool)
-        changes = np.array([other.estimate(every, attenuation_per_m) for other in others]) - whole
+        changes = np.array([each.estimate(np.ones(BLOCKS, bool), attenuation_per_m) for each in others]) - whole
         return changes.T @ changes / len(changes)
 
     def estimate_with_covariance(self, attenuation_per_m: float | None = None) -> tuple[np.ndarray, np.ndarray]:
