@@ -158,13 +158,14 @@ def fit_radiometry(
         )
         whole, covariance = evidence.estimate_with_covariance()
         separated = math.sqrt(covariance[1, 1]) < _KNOWN_ATTENUATION
-        covariance += evidence.spread(whole, others)
         with nullcontext() if repeats is None else open_capture(repeats) as again:
             noise = measure_noise(scan if again is None else again)
         parts = (
             *evidence.judge(whole, covariance, _natural_absorption(scan.header)),
             *([] if noise is None else [noise.fit]),
         )
+        # With another phase function the absorption may seem unnatural: that is said, too.
+        covariance = covariance + evidence.spread(whole, others)
         doubtful = {name for part in parts if part.misfit > 1 for name in part.names}
         log_warnings(scan.path.name, [f"the fit of its {part.line()}" for part in parts if part.misfit > 1])
         determined = separated and "attenuation_per_m" not in doubtful
@@ -314,8 +315,7 @@ class _Evidence:
         self, whole: np.ndarray, others: Sequence[_Evidence], attenuation_per_m: float | None = None
     ) -> np.ndarray:
         """Return the mean square of the changes of the estimates ``whole`` with other phase functions."""
-        every = np.ones(BLOCKS, bool)
-        changes = np.array([other.estimate(every, attenuation_per_m) for other in others]) - whole
+        changes = np.array([each.estimate(np.ones(BLOCKS, bool), attenuation_per_m) for each in others]) - whole
         return changes.T @ changes / len(changes)
 
     def estimate_with_covariance(self, attenuation_per_m: float | None = None) -> tuple[np.ndarray, np.ndarray]:

@@ -132,12 +132,5 @@ def _waist_radius_mm(laser: Laser, radius_mm: float, distance_mm: float, *, medi
 def _followed_medium(medium: Medium, attenuation_per_m: float, scattering_per_m: float) -> Medium:
     """Return the medium with fitted absorption and scattering; its phase function is the one of the fit."""
     scattering = max(scattering_per_m, 0.0)
-    return medium.model_copy(
-        update={
-            "water": None,
-            "turbidity": None,
-            "absorption_per_m": max(attenuation_per_m - scattering, 0.0),
-            "scattering_per_m": scattering,
-            "phase": medium.phase or PARTICLES,
-        }
-    )
+    found = {"absorption_per_m": max(attenuation_per_m - scattering, 0.0), "scattering_per_m": scattering}
+    return medium.model_copy(update={"water": None, "turbidity": None, "phase": medium.phase or PARTICLES} | found)

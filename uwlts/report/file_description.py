@@ -138,7 +138,13 @@ _DESCRIPTIONS = (
 """Kinds of descriptions, keys by which they are recognised in this order, and the command that uses them."""
 
 
-def describe(path: str | Path, *, unit: Unit | None = None, schema: str | Path | None = None) -> str:
+def describe(
+    path: str | Path,
+    *,
+    unit: Unit | None = None,
+    schema: str | Path | None = None,
+    pose_format: PoseFormat = SAVED_FORMAT,
+) -> str:
     """Describe a file that `read` reads, a digital calibration certificate, a sensor (by name or path), or a plan.
 
     Parameters
@@ -150,6 +156,8 @@ def describe(path: str | Path, *, unit: Unit | None = None, schema: str | Path |
     schema : str or Path, optional
         XML schema (dcc.xsd) by which a digital calibration certificate is validated. Schemas that it imports are beside
         it.
+    pose_format : str
+        Format of a trajectory, such as euler-ZYX-deg, tum or ros, as for `reconstruct`.
 
     Returns
     -------
@@ -165,15 +173,15 @@ def describe(path: str | Path, *, unit: Unit | None = None, schema: str | Path |
     """
     name, path = str(path), Path(path)
     endings = [each for each in path.suffixes if each != ".part"]
-    if not endings or endings[-1] == ".toml":
+    if (not endings and not path.is_dir()) or endings[-1:] == [".toml"]:
         lines = _other_description(path) or sensor_lines(load_sensor(name))
-    elif endings[-1] == ".xml":
+    elif endings[-1:] == [".xml"]:
         lines = digital_certificate_lines(path, schema)
-    elif endings[-2:] == [".truth", ".h5"] or (endings[-1] == ".h5" and read_format(path) == TRUTH):
+    elif endings[-2:] == [".truth", ".h5"] or (endings[-1:] == [".h5"] and read_format(path) == TRUTH):
         lines = truth_lines(*read_truth(path))
     else:
         try:
-            lines = _lines_of(read(path, unit=unit))
+            lines = _lines_of(read(path, unit=unit, pose_format=pose_format))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise CaptureError(f"{path} is damaged: a value is missing or not a number ({error})") from error
     return "\n".join(lines)

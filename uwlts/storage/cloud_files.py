@@ -13,11 +13,12 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike
 
-from uwlts.errors import CaptureError
+from uwlts.errors import CaptureError, OutputError
 from uwlts.files.reading import log_warnings, open_regular, parse_json, require_regular_file
 from uwlts.files.writing import refuse_unsuitable, require_ending, write_atomically
 from uwlts.model.sensor import Description, Table
 from uwlts.storage.cloud import (
+    FARTHEST_SINGLE_MM,
     KINDS,
     NO_INDEX,
     OPTIONAL,
@@ -52,8 +53,8 @@ CLOUD_FORMATS = (".ply", ".h5", *(ending for ending, each in FORMATS.items() if 
 COLOURED_FORMATS = (".ply", ".h5", *(ending for ending, each in FORMATS.items() if each.coloured))
 """Endings of the clouds that can be written with a colour of each point."""
 PLY_COLOURS = ("red", "green", "blue")
-FULL = ".full.ply"
-"""Ending of PLY files with the whole uncertainty."""
+FULL, SINGLE = ".full.ply", ".float.ply"
+"""Endings of PLY files with the whole uncertainty, and with coordinates as float, for programs that read no double."""
 _LEAN = (
     "it holds the standard deviations of each point along the surface normal, and no errors that points share: results "
     f"have no uncertainty. Use the cloud in HDF5 (NAME.h5) or in PLY with the whole uncertainty (NAME{FULL})"
@@ -94,7 +95,10 @@ def write_cloud(
     if _in_hdf5(path):
         _write_hdf5(path, cloud, overwrite=overwrite)
         return
-    columns = dict(zip("xyz", cloud.points_mm.T, strict=True))
+    single = str(path).lower().endswith(SINGLE)
+    if single and np.abs(cloud.points_mm).max(initial=0.0) > FARTHEST_SINGLE_MM:
+        raise OutputError(f"{path}: the cloud reaches beyond 16 m from the origin, too far for float: write NAME.ply")
+    columns = dict(zip("xyz", cloud.points_mm.T.astype(np.float32 if single else np.float64), strict=True))
     if colours is not None:
         columns |= dict(zip(PLY_COLOURS, colours.T, strict=True))
     full = not is_lean(path)
@@ -277,7 +281,7 @@ def _every(count: int, at_most: int | None) -> slice:
 
 def name_cloud(path: str | os.PathLike[str]) -> str:
     """Return the name of a cloud's file without its ending, such as ``.ply`` or ``.cloud.h5``."""
-    return re.sub(r"\.(cloud|full)$", "", Path(path).stem)
+    return re.sub(r"\.(cloud|full|float)$", "", Path(path).stem)
 
 
 def is_lean(path: str | os.PathLike[str]) -> bool:

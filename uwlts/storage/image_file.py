@@ -50,11 +50,6 @@ class ImageHeader:
     inverted_bits: int = 0
 
 
-def read_image_file(path: str | Path) -> bytes:
-    """Read an image file; raises ImageError if it is missing, not a regular file, or too large."""
-    return read_bytes(path, most_bytes=_MOST_BYTES, error=ImageError, called="image")
-
-
 def read_header(content: bytes, path: str | Path) -> ImageHeader:
     """Read the header of an image; raises ImageError if it is foreign, damaged, or declares too many pixels.
 
@@ -134,7 +129,7 @@ def read_image(path: Path, *, accept: Callable[[ImageHeader], None] = lambda dec
     ``accept`` may reject the declared header before the image is decoded. Raises ImageError if the file is missing,
     foreign or truncated, or has an alpha channel, several pages, or values other than integers of 8 or 16 bit.
     """
-    content = read_image_file(path)
+    content = read_bytes(path, most_bytes=_MOST_BYTES, error=ImageError, called="image")
     declared = read_header(content, path)
     accept(declared)
     kind = declared.kind

@@ -210,7 +210,7 @@ def read_profiles(
             table = read_number_table(file, digests)
             names.append(file.stem)
             profiles.append(_points_of(table, unit))
-            times.append(_one_time(table.columns))
+            times.append(float(next(iter(table.columns.get("time_s", ())), np.nan)))
     elif path.suffix.lower() in (".ply", ".h5") and is_cloud(path):
         digests[path.name] = hash_file(path)
         cloud = read_cloud(path)
@@ -231,11 +231,6 @@ def read_profiles(
         times = [float(each[poses == label][0]) for label in labels]
     known = np.array(times)
     return names, profiles, known if np.isfinite(known).all() else None
-
-
-def _one_time(columns: dict[str, np.ndarray]) -> float:
-    times = columns.get("time_s")
-    return float(times[0]) if times is not None and len(times) else np.nan
 
 
 def _points_of(table: NumberTable, unit: Unit | None) -> np.ndarray:

@@ -327,10 +327,9 @@ def _seems_decimal(lines: list[bytes]) -> bool:
 
 def _without_count(lines: list[bytes]) -> tuple[list[bytes], int | None]:
     """Remove a first line with the number of rows alone, if the next line has more cells; return it too."""
-    if len(lines) > 1 and lines[0].isdigit() and len(lines[0]) < 12:
-        further = len(_cells(lines[1], _separators(lines[1])[0]))
-        return (lines[1:], int(lines[0])) if further > 1 else (lines, None)
-    return lines, None
+    counts = len(lines) > 1 and lines[0].isdigit() and len(lines[0]) < 12
+    counts = counts and len(_cells(lines[1], _separators(lines[1])[0])) > 1
+    return (lines[1:], int(lines[0])) if counts else (lines, None)
 
 
 def _without_block(lines: list[bytes]) -> tuple[list[bytes], list[bytes]]:

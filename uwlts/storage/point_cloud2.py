@@ -74,16 +74,11 @@ def pack_points(cloud: PointCloud, covariance: Mapping[str, np.ndarray]) -> np.n
     return table
 
 
-def packed_layout(table: np.ndarray) -> dict[str, tuple[np.dtype, int]]:
-    """Return type and offset of each field of packed rows."""
-    return {name: (entry[0], entry[1]) for name, entry in (table.dtype.fields or {}).items()}
-
-
 def point_cloud2(table: np.ndarray, types: MessageTypes, *, time_ns: int, frame_id: str) -> Any:
     """Return the message of packed rows (`pack_points`): one unordered row of points, all of them finite."""
     fields = [
         types.point_field(name=name, offset=int(offset), datatype=_DATATYPES[kind.str[1:]], count=1)
-        for name, (kind, offset) in packed_layout(table).items()
+        for name, (kind, offset, *_) in (table.dtype.fields or {}).items()
     ]
     stamp = types.time(sec=time_ns // NANOSECONDS, nanosec=time_ns % NANOSECONDS)
     return types.point_cloud2(

@@ -2,9 +2,12 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
+from tests.uwlts.storage.test_ros_bags import write_ros2
 from uwlts.errors import CaptureError
 from uwlts.model.sensor import Sensor
 from uwlts.optics.nominal import nominal
@@ -55,3 +58,24 @@ def test_other_files_are_refused_with_what_is_read(tmp_path: Path, name: str, te
 def test_info_names_the_kind_of_a_description(tmp_path: Path, content: str, kind: str):
     (tmp_path / "a.toml").write_text(content)
     assert describe(tmp_path / "a.toml").startswith(kind)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_trajectories_of_each_format_are_described_alike(tmp_path: Path, seed: int):
+    rng = np.random.default_rng(seed)
+    turns, places, times = Rotation.random(6, random_state=seed), rng.uniform(-2.0, 2.0, (6, 3)), np.arange(6.0)
+    euler = np.column_stack([times, places, turns.as_euler("xyz", degrees=bool(seed % 2))])
+    unit = "deg" if seed % 2 else "rad"
+    np.savetxt(tmp_path / "path.tum", np.column_stack([times, places, turns.as_quat()]), fmt="%.12f")
+    names = f"time_s,x_m,y_m,z_m,roll_{unit},pitch_{unit},yaw_{unit}"
+    np.savetxt(tmp_path / "path.csv", euler, fmt="%.12f", delimiter=",", header=names, comments="")
+    text = describe(tmp_path / "path.tum")
+    assert text.startswith("trajectory of 6 poses from 0 s to 5 s") and "axes of the platform in the last pose" in text
+    assert describe(tmp_path / "path.csv", pose_format=f"euler-xyz-{unit}") == text
+
+
+def test_a_bag_of_poses_is_described(tmp_path: Path):
+    bag = write_ros2(tmp_path / "bag", {"/odom": "nav_msgs/msg/Odometry"})
+    assert describe(bag, pose_format="ros").startswith("trajectory of 6 poses")
+    with pytest.raises(CaptureError, match="it is a directory"):
+        describe(bag)

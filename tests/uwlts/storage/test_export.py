@@ -267,3 +267,18 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert "exists already" in capsys.readouterr().err
     assert called("export", str(tmp_path / "a.ply"), "--out", str(tmp_path / "a.laz"), "--overwrite") == 0
     assert_same(tmp_path / "a.h5", tmp_path / "b.h5")
+
+
+@pytest.mark.parametrize("reach_mm", [1.0, 300.0, 7000.0])
+def test_ply_with_float_is_read_by_programs_without_double(tmp_path: Path, reach_mm: float):
+    """Declared as float, as PCL needs it, and exact to the rounding of 24 bits."""
+    cloud = a_cloud(reach_mm=reach_mm)
+    write_cloud(tmp_path / "a.float.ply", cloud)
+    head = (tmp_path / "a.float.ply").read_bytes().partition(b"end_header")[0]
+    assert all(f"property float {axis}\n".encode() in head for axis in "xyz")
+    found = read_cloud(tmp_path / "a.float.ply")
+    assert np.abs(found.points_mm - cloud.points_mm).max() <= 2.0**-24 * np.abs(cloud.points_mm).max()
+    assert np.array_equal(found.frame, cloud.frame) and found.metadata["medium"] == "water"
+    with pytest.raises(OutputError, match="beyond 16 m from the origin"):
+        write_cloud(tmp_path / "b.float.ply", a_cloud(reach_mm=1e5))
+    assert not (tmp_path / "b.float.ply").exists()
