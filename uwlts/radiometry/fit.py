@@ -518,6 +518,6 @@ def _not_separable(
     if by_name["stripe_sigma_px"].value < _LEAST_SIGMA_PX:
         found.append("radius of the sheet and pixel: the stripe is narrower than a pixel, and the radius is its limit")
     found.append("waist and focus of the sheet: only its radius at the surface; the described focus is kept")
-    found.append("sheet and a surface that light enters by up to 0.2 mm: it seems up to a quarter thicker")
+    found.append("sheet and a surface that light enters by up to 0.4 mm: it seems up to 40 % thicker")
     found.append("background by dark current, black level and daylight: only their sum at this exposure")
     return tuple(found)
