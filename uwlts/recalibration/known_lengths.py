@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.artefact_figures import evaluate_cloud
@@ -42,7 +42,7 @@ class KnownLengths:
     def chances(self, unknowns: np.ndarray, covariance: np.ndarray) -> np.ndarray:
         """Return the probability (L,) of residuals as large after an estimate with a covariance (U, U)."""
         variance = 1.0 - np.einsum("lu,uv,lv->l", self.rows, covariance, self.rows)
-        return chi2.sf(self.residuals(unknowns) ** 2 / np.maximum(variance, 1e-6), 1)
+        return chdtrc(1, self.residuals(unknowns) ** 2 / np.maximum(variance, 1e-6))
 
 
 def measure_known_lengths(
@@ -64,10 +64,10 @@ def measure_known_lengths(
     noise = np.einsum("lni,ni->ln", by_points, points.by_px) * points.noise_px
     by_image = np.einsum("lni,kni->lkn", by_points, points.image_mm)
     of_images = np.array([[np.sum(np.bincount(points.image, part) ** 2) for part in row] for row in by_image])
-    calibrated = [figure.key.calibrated for figure in figures]
-    known = np.array([(each.uncertainty_mm or 0.0) / 2.0 if each else 0.0 for each in calibrated])
+    calibrated = [figure.key.calibrated for figure in figures if figure.key.calibrated is not None]
+    known = np.array([(each.uncertainty_mm or 0.0) / 2.0 for each in calibrated])
     return KnownLengths(
-        tuple(each.name if each else "" for each in calibrated),
+        tuple(each.name for each in calibrated),
         np.array([figure.value_mm for figure in figures]),
         np.einsum("lni,niu->lu", by_points, points.by_unknowns),
         np.sqrt(np.sum(noise**2, axis=1) + np.sum(of_images, axis=1) + known**2),

@@ -11,14 +11,12 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from uwlts.errors import CalibrationError, EvaluationError
-from uwlts.fitting.least_squares import biweight
 from uwlts.fitting.patches import find_disc_radius
 from uwlts.fitting.propagation import noise_shifts
-from uwlts.recalibration.pass_estimate import POOR_FIT, chance, estimate_covariance, normal_equations
-from uwlts.recalibration.surface_cells import CELL, PassPoints, divide, observe
+from uwlts.recalibration.pass_estimate import POOR_FIT, chance, estimate_covariance, normal_equations, weigh
+from uwlts.recalibration.surface_cells import CELL, LINES, PassPoints, divide, observe
 from uwlts.storage.cloud import PointCloud
 
-_LINES = 4  # one of these many profile lines, as for a recalibration
 _MOST_POINTS = 30_000  # for a second of computation
 _SMOOTHED = 9
 """Number of images whose mean motion is the direction of a pass: steps vary with what is seen."""
@@ -87,7 +85,7 @@ def check_passes(cloud: PointCloud) -> PassCheck | None:
     if cloud.uncertainty is None or cloud.time_s is None:
         return None
     number = split_passes(cloud)
-    chosen = np.flatnonzero((cloud.line % _LINES == 0) & (number >= 0))
+    chosen = np.flatnonzero((cloud.line % LINES == 0) & (number >= 0))
     chosen = chosen[:: max(1, len(chosen) // _MOST_POINTS)]
     number, known, places = number[chosen], cloud.uncertainty[chosen], cloud.points_mm[chosen]
     if len(np.unique(number)) < 2:
@@ -112,9 +110,7 @@ def check_passes(cloud: PointCloud) -> PassCheck | None:
     total, gradient = normal_equations(cells, np.ones(len(cells)), none)
     amplitudes = -np.linalg.solve(total, gradient)
     left = [cell.apart.T @ (cell.residuals + cell.rows @ amplitudes) for cell in cells]
-    squares = np.array([np.mean(each**2) for each in left])
-    weights = biweight(np.sqrt(squares / max(float(np.median(squares)), 1e-12)))
-    spread = max(1.0, float(np.sqrt(np.mean(squares[weights > 0]))))
+    weights, spread = weigh(np.array([np.mean(each**2) for each in left]))
     total, gradient = normal_equations(cells, weights, none)
     amplitudes = -np.linalg.solve(total, gradient)
     covariance = estimate_covariance(cells, weights, total, points, None)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from uwlts.calibration.joint.stored_estimate import StoredEstimate
 from uwlts.calibration.sequential.sheet_fit import object_frame
@@ -239,10 +239,7 @@ def solve_passes(problem: PassProblem, *, size_mm: float, artefact: Artefact | N
             cell_of = np.full(len(points.number), -1)
             for number, cell in enumerate(cells):
                 cell_of[cell.some] = number
-            squares = np.array([cell.offset_square for cell in cells])
-            weights = biweight(np.sqrt(squares / max(float(np.median(squares)), 1e-12)))
-            # Birge's ratio: the disagreement of passes relative to their noise.
-            spread = max(1.0, float(np.sqrt(np.mean(squares[weights > 0]))))
+            weights, spread = weigh(np.array([cell.offset_square for cell in cells]))
         elif done < _FREE_ROUNDS:
             weights = np.ones(len(cells))
         total, gradient = normal_equations(cells, weights, amplitudes)
@@ -261,6 +258,12 @@ def solve_passes(problem: PassProblem, *, size_mm: float, artefact: Artefact | N
         )
     covariance = estimate_covariance(cells, weights, total, points, lengths)
     return PassSolution(amplitudes, covariance, first_cells, cells, spread, used, lengths)
+
+
+def weigh(squares: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return weights (C,) of cells by their whitened disagreement, and Birge's ratio of it to the noise, at least 1."""
+    weights = biweight(np.sqrt(squares / max(float(np.median(squares)), 1e-12)))
+    return weights, max(1.0, float(np.sqrt(np.mean(squares[weights > 0]))))
 
 
 def normal_equations(
@@ -309,4 +312,4 @@ def chance(amplitudes: np.ndarray, covariance: np.ndarray, directions: np.ndarra
     values, vectors = np.linalg.eigh(np.eye(len(own)) - after)
     tested = values > _DETERMINED
     square = float(np.sum((vectors.T @ own)[tested] ** 2 / values[tested]))
-    return float(chi2.sf(square, int(tested.sum()))) if tested.any() else 1.0
+    return float(chdtrc(int(tested.sum()), square)) if tested.any() else 1.0

@@ -31,7 +31,7 @@ from uwlts.recalibration.pass_estimate import (
     chance,
     solve_passes,
 )
-from uwlts.recalibration.surface_cells import CELL, Cell
+from uwlts.recalibration.surface_cells import CELL, LINES, Cell
 from uwlts.reconstruction.point_uncertainty import estimate_stripe_noise_px, independent_components, window_shift_std_mm
 from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.runtime.progress import ProgressListener, ignore_progress
@@ -47,9 +47,6 @@ _MOST_POINTS = 15_000
 _SHIFTED = 1.0
 """Largest shift by blur or brightness relative to a centre's noise: both are wrong where they are large, at edges. Seen
 on rendered pipes, flanges and welds (seeds 1 to 3 of the study), where such points alone contradicted each other."""
-_LINES = 4
-"""One of these many profile lines is used: speckle correlates the noise of neighbours, which the surface would
-follow. With all lines, lengths were 0.03 mm too short (seeds 1, 2, 6, 7)."""
 _FALSE_ALARM = 0.05
 """Probability of a doubt about right passes, by all tests together."""
 _APART = 0.25
@@ -324,7 +321,7 @@ def _gather(
     kept, blur = stripes[chosen], blur[chosen]
     noise = estimate_stripe_noise_px(kept.frame, kept.line, kept.centre_px)
     # At edges, blur and brightness shift the centres by amounts that are known roughly.
-    few = np.flatnonzero((np.abs(blur) < _SHIFTED * noise) & (kept.line % _LINES == 0))
+    few = np.flatnonzero((np.abs(blur) < _SHIFTED * noise) & (kept.line % LINES == 0))
     few = few[:: max(1, len(few) // _MOST_POINTS)]
     kept, noise, points = kept[few], noise[few], cloud.points_mm[few]
     of_images = np.where(posed[:, None, None], of_frames, np.eye(4))
