@@ -34,6 +34,7 @@ MEANING = {
         "--index": "[Rr]efractive index",
         "--kind": "Kind of the object",
         "--medium": "One of the sensor's media",
+        "--mount": "Pose of the sensor on its platform",
         "--out": "to write|New folder",
         "--title": "Title of the",
         "--overwrite": "Replace|replace",

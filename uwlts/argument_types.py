@@ -29,7 +29,7 @@ _SHORT = Repr()  # short texts of values, for messages
 _SHORT.maxstring = _SHORT.maxother = 60
 
 
-OUTPUTS = frozenset({"out", "coloured", "aligned", "page", "poses_out"})
+OUTPUTS = frozenset({"out", "coloured", "aligned", "page", "poses_out", "mount_out"})
 """Names of command parameters that are outputs; all other parameters that name a file are inputs."""
 _WRITTEN = OUTPUTS | {"path"}
 """Names of function parameters that may be outputs; a function that reads its ``path`` writes nothing else."""

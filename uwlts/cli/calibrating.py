@@ -149,6 +149,11 @@ def recalibrate(
         a_file(".json"),
         Parameter(help="Calibration to write. Without it, the passes only check the old one."),
     ] = None,
+    mount_out: Annotated[
+        Path | None,
+        a_file(".json"),
+        Parameter(help="Mount to write: the one that belongs to the new calibration, if a mount is given."),
+    ] = None,
     page: Annotated[
         Path | None,
         a_page("recalibration"),
@@ -160,6 +165,8 @@ def recalibrate(
 
     The exit code is 1, and no calibration is written, if the passes contradict each other or the old calibration.
     """
+    if (out is not None and "mount" in call.given) != (mount_out is not None):
+        raise DescriptionError("a new calibration needs its own mount: give `mount`, `out` and `mount_out` together")
     found = call()
     show(found.lines())
     warn(*found.warnings, *found.doubts)
@@ -170,7 +177,9 @@ def recalibrate(
         sys.exit(1)
     if out is not None:
         found.calibration.save(out, overwrite=overwrite)
-    wrote_files(out, page)
+    if mount_out is not None and found.mount is not None:
+        found.mount.mount.save(mount_out, overwrite=overwrite)
+    wrote_files(out, mount_out, page)
 
 
 @command_from(app, uwlts, "calibrate_polynomials", job="Calibrate", shortcuts=STRIPE)

@@ -60,7 +60,8 @@ class PassCheck:
 def split_passes(cloud: PointCloud) -> np.ndarray:
     """Return the pass (N,) of each point: a pass ends where the images' motion turns by more than 90 deg.
 
-    Images about a turn belong to no pass, -1, so that the end of a pass is no overlap with the next one.
+    Images about a turn belong to no pass, -1, so that the end of a pass is no overlap with the next one. The same holds
+    for passes of fewer images than the mean motion needs.
     """
     image, of_point = np.unique(cloud.frame, return_inverse=True)
     sums = [np.bincount(of_point, axis) for axis in cloud.points_mm.T]
@@ -77,6 +78,7 @@ def split_passes(cloud: PointCloud) -> np.ndarray:
         number = np.searchsorted(turns, np.arange(len(image)), side="right")
         for each in turns:
             number[max(0, each - _SMOOTHED // 2) : each + _SMOOTHED // 2] = -1
+        number[np.bincount(number + 1)[number + 1] < _SMOOTHED] = -1
     return number[of_point]
 
 

@@ -17,7 +17,7 @@ from uwlts.calibration.sequential.sheet_fit import object_frame
 from uwlts.errors import CalibrationError
 from uwlts.fitting.least_squares import biweight
 from uwlts.model.artefacts import Artefact
-from uwlts.model.calibration import Calibration
+from uwlts.model.calibration import Calibration, rigid_transform
 from uwlts.recalibration.known_lengths import KnownLengths, measure_known_lengths
 from uwlts.recalibration.surface_cells import Cell, PassPoints, divide, observe
 
@@ -41,7 +41,8 @@ class Pass:
 
     ``beside_mm`` (N, 3) are shifts of the points to the origin of their light in the OCS. ``travel_mm`` (N,) is the
     position of the stage, and ``frame`` (N,) the image. ``pose`` (F, 4, 4) transforms the OCS of each image, with the
-    stage at zero, to the common frame.
+    stage at zero, to the common frame. ``rates`` (F, 6) are the velocity of its origin, mm/s, and its angular velocity,
+    rad/s, in that frame, or None without a clock of the platform.
     """
 
     name: str
@@ -52,6 +53,25 @@ class Pass:
     beside_mm: np.ndarray
     travel_mm: np.ndarray
     pose: np.ndarray
+    rates: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class MountErrors:
+    """Errors of a mount (4, 4), ``T_platform_sensor``, that places the OCS of the earlier calibration.
+
+    ``by`` (7, M) are derivatives by the components that all passes share: of its translation, mm, and rotation, rad,
+    along the platform's axes, and of the lead of the platform's clock, s.
+    """
+
+    transform: np.ndarray
+    by: np.ndarray
+
+    def correction(self, components: np.ndarray) -> np.ndarray:
+        """Return the transform (4, 4) of points in the OCS that replaces a change of the mount."""
+        back = self.transform[:3, :3].T
+        shift, turn, _ = np.split(self.by @ components, [3, 6])
+        return rigid_transform(Rotation.from_rotvec(back @ turn).as_matrix(), back @ shift)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +113,7 @@ class PassProblem:
     ``root`` (P, M) are changes of the parameters and ``by_stage`` (M, 3) shifts per mm of travel by the independent
     components; the last one is a shift of the OCS along X by ``window_shift_mm``. ``direction`` (3,) is that of the
     stage before. ``drift`` is the standard uncertainty of the index in each pass. ``middle_mm`` (3,) is the position
-    from which the poses' scale counts.
+    from which the poses' scale counts. Without a ``mount``, the poses are those of the OCS of the true sensor.
     """
 
     passes: Sequence[Pass]
@@ -105,6 +125,7 @@ class PassProblem:
     drift: float
     motion: MotionUncertainty
     middle_mm: np.ndarray
+    mount: MountErrors | None = None
 
     @property
     def of_sensor(self) -> int:
@@ -130,15 +151,25 @@ class PassProblem:
         """Return the shift (3,) per mm of travel in the OCS."""
         return self.direction + self.by_stage.T @ amplitudes[: self.root.shape[1]]
 
+    def earlier_from_moved(self, moved: StoredEstimate) -> np.ndarray:
+        """Return the transform (4, 4) from the OCS of a moved estimate to that of the earlier calibration."""
+        return np.linalg.inv(self.known.calibration.object_transform()) @ moved.calibration.object_transform()
+
     def place(self, amplitudes: np.ndarray, corrections_px: Sequence[np.ndarray]) -> PassPoints:
         """Return the points of all passes with derivatives, from corrected stripe centres.
 
         Raises CalibrationError if a centre gives no point.
         """
         known = self.moved(amplitudes)
-        rigid = -known.frame_by @ self.root
-        rigid[0, -1] += self.window_shift_mm
+        parts_of = self.root.shape[1]
         direction, medium = self.stage_direction(amplitudes), known.view.medium
+        if self.mount is None:
+            rigid, correction = -known.frame_by @ self.root, np.eye(4)
+        else:
+            back = self.mount.transform[:3, :3].T
+            rigid = np.vstack([back @ self.mount.by[:3], back @ self.mount.by[3:6]])
+            correction = self.mount.correction(amplitudes[:parts_of]) @ self.earlier_from_moved(known)
+        rigid[0, -1] += self.window_shift_mm
         # In air no index drifts.
         place = 0 if medium is None else known.parameters.places[known.parameters.index_key(medium)]
         parts, first = [], 0
@@ -150,9 +181,8 @@ class PassProblem:
             found = estimate.triangulate(each.line, each.centre_px + corrections_px[number])
             if found is None:
                 raise CalibrationError(f"{each.name}: the passes lead to a calibration that gives no point")
-            points, by = found
+            points, by = found[0] @ correction[:3, :3].T + correction[:3, 3], correction[:3, :3] @ found[1]
             local = np.zeros((len(points), 3, self.unknowns))
-            parts_of = self.root.shape[1]
             local[:, :, :parts_of] = by[:, :, 1:] @ self.root
             local[:, :, :parts_of] += rigid[:3] + np.cross(rigid[3:].T, points[:, None]).swapaxes(1, 2)
             local[:, :, :parts_of] += each.travel_mm[:, None, None] * self.by_stage.T
@@ -165,6 +195,11 @@ class PassProblem:
             moved = rotation @ local
             by_px = np.einsum("nij,nj->ni", rotation, by[:, :, 0])
             along = rotation @ direction
+            if self.mount is not None and each.rates is not None:
+                speed, spin = np.split(each.rates[each.frame], 2, axis=1)
+                speed = speed + np.cross(spin, places - origin)
+                places = places + speed * (self.mount.by[6] @ amplitudes[:parts_of])
+                moved[:, :, :parts_of] += speed[:, :, None] * self.mount.by[6]
             moved[:, :, parts_of] = from_middle
             # Errors of a pose turn about the middle of its points.
             middle = places.mean(axis=0)

@@ -10,21 +10,26 @@ import numpy as np
 
 from uwlts.calibration.joint.observability import compute_lengths, project_sheet_points, sample_sheet
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, read_stored_estimate, require_joint
-from uwlts.errors import CalibrationError, CaptureError, RangeError
-from uwlts.fitting.next_observation import Forecast
+from uwlts.errors import CalibrationError, CaptureError, DescriptionError, RangeError
+from uwlts.fitting.next_observation import CovarianceRoot, Forecast
 from uwlts.fitting.patches import find_disc_radius
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.artefacts import Artefact, parse_artefact, read_artefact
 from uwlts.model.calibration import Calibration, KnownMedium, KnownStage
 from uwlts.model.library import load_sensor
+from uwlts.model.mount import Mount
 from uwlts.model.parameter_keys import ParameterKey
 from uwlts.model.short_text import Brief
+from uwlts.model.trajectory import Trajectory
 from uwlts.optics.brightness import select_sharp_lines
 from uwlts.recalibration.as_built import as_built
+from uwlts.recalibration.moved_mount import MovedMount, move_mount
 from uwlts.recalibration.next_pass import NextPass, rank_passes
+from uwlts.recalibration.pass_check import split_passes
 from uwlts.recalibration.pass_estimate import (
     POOR_FIT,
     MotionUncertainty,
+    MountErrors,
     Pass,
     PassProblem,
     PassSolution,
@@ -32,13 +37,15 @@ from uwlts.recalibration.pass_estimate import (
     solve_passes,
 )
 from uwlts.recalibration.surface_cells import CELL, LINES, Cell
+from uwlts.reconstruction.moving import add_platform_poses, find_platform_poses
 from uwlts.reconstruction.point_uncertainty import estimate_stripe_noise_px, independent_components, window_shift_std_mm
 from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.calibration_file import read_calibration
-from uwlts.storage.capture import Capture, open_captures, sensor_poses
+from uwlts.storage.capture import Capture, FrameTable, open_captures, sensor_poses
+from uwlts.storage.mount_files import read_mount
 from uwlts.storage.number_tables import Unit
-from uwlts.storage.pose_files import PoseFormat, read_poses
+from uwlts.storage.pose_files import PoseFormat, read_poses, read_trajectory
 from uwlts.stripe import StripeSettings, find_stripes
 
 _LENGTH_MM = 100.0
@@ -127,6 +134,8 @@ class Recalibrated(Brief):
         Reasons against the new calibration; it should not be used if there are any.
     warnings : tuple of str
         Doubts about single passes, as by `reconstruct`.
+    mount : MovedMount or None
+        The mount that belongs to the new calibration, if one was given.
     """
 
     passes: tuple[str, ...]
@@ -139,6 +148,7 @@ class Recalibrated(Brief):
     next_passes: tuple[Forecast[NextPass], ...]
     doubts: tuple[str, ...]
     warnings: tuple[str, ...] = ()
+    mount: MovedMount | None = None
 
     def lines(self) -> list[str]:
         """Return a summary as text."""
@@ -153,6 +163,7 @@ class Recalibrated(Brief):
         lines += [each.line() for each in self.parameters if each.determined]
         if kept := [each.key.quantity.words for each in self.parameters if not each.determined]:
             lines.append(f"not determined by these passes, known from before: {', '.join(kept)}")
+        lines += [] if self.mount is None else self.mount.lines()
         lines += self.advice()
         return lines
 
@@ -165,6 +176,9 @@ class Recalibrated(Brief):
                 | {"after": each.after, "std": each.std, "determined": each.determined}
                 for each in self.parameters
             ],
+            "mount": None
+            if self.mount is None
+            else self.mount.mount.model_dump(mode="json", exclude={"poses", "inputs"}),
             "parts": len(self.parts.passes),
             "scatter_by_noise": self.spread,
             "next_passes": [
@@ -195,6 +209,8 @@ def recalibrate(
     poses: np.ndarray | str | Path | None = None,
     pose_format: PoseFormat = "matrix",
     pose_unit: Unit | None = None,
+    mount: Mount | str | Path | None = None,
+    trajectory: Trajectory | str | Path | None = None,
     artefact: Artefact | dict[str, object] | str | Path | None = None,
     stripe: StripeSettings = None,
     progress: ProgressListener = ignore_progress,
@@ -218,7 +234,13 @@ def recalibrate(
         Pose of the sensor in each pass, as the transform from its OCS (stage at zero) to a common frame: an array or a
         table. By default the frames have poses, all in one frame; a single pass needs none.
     pose_format, pose_unit
-        As for `reconstruct`.
+        As for `reconstruct`; of ``poses`` or of the trajectory.
+    mount : Mount or path, optional
+        Pose of the sensor on its platform (uwlts mount). The poses of the images are then those of the platform, and
+        the mount and the offset of the platform's clock are estimated too. By default the mount in a capture is exact.
+    trajectory : Trajectory or path, optional
+        File with times and poses of the platform, or of the sensor without a mount, as for `reconstruct`. A capture
+        with poses is split where the motion turns by more than 90 deg: each part is a pass.
     artefact
         Pipe, step or spheres of known size that all the passes see, as for `evaluate`: known lengths of the job.
     stripe
@@ -234,7 +256,7 @@ def recalibrate(
     Raises
     ------
     CaptureError
-        A file cannot be read, or the passes are of different sensors or media.
+        A file cannot be read, or the passes are of different sensors or media, or two are the same.
     CalibrationError
         The calibration states no uncertainty or does not fit, or the passes do not overlap.
     EvaluationError
@@ -259,7 +281,13 @@ def recalibrate(
     )
     if given is not None and len(given) != len(passes):
         raise CaptureError(f"{len(given)} poses are given for {len(passes)} passes: give one for each, in their order")
-    if given is None and len(passes) == 1:
+    if given is not None and (mount is not None or trajectory is not None):
+        raise DescriptionError("`poses` are those of the sensor: give either them, or a mount or a trajectory")
+    mount = read_mount(mount) if isinstance(mount, str | Path) else mount
+    if isinstance(trajectory, str | Path):
+        trajectory = read_trajectory(trajectory, pose_format=pose_format, unit=pose_unit)
+    of_platform = mount is not None or trajectory is not None
+    if given is None and len(passes) == 1 and not of_platform:
         given = np.eye(4)[None]
     with open_captures(passes) as scans:
         if not scans:
@@ -275,15 +303,28 @@ def recalibrate(
         else:
             prior = read_calibration(calibration)
         require_joint(prior)
-        gathered, warnings = [], []
+        gathered, warnings = list[Pass](), []
         for number, scan in enumerate(scans):
-            one, doubts = _gather(scan, prior, None if given is None else given[number], stripe)
-            gathered.append(one)
+            table, rates = scan, None
+            if of_platform:
+                ride = find_platform_poses(scan, trajectory, mount=mount, clock_offset_s=None)
+                table, rates = add_platform_poses(scan, ride, mount), ride.rates
+                warnings += ride.doubts
+            some, doubts = _gather(scan, table, rates, prior, None if given is None else given[number], stripe)
+            for each in gathered:
+                if any(np.array_equal(each.centre_px, one.centre_px) for one in some):
+                    raise CaptureError(f"{scan.path.name} holds the same stripes as {each.name}: give each pass once")
+            gathered += some
             warnings += [text if scan.path.name in text else f"{scan.path.name}: {text}" for text in doubts]
             progress(number + 1, len(scans) + 1)
+        if mount is None and any(scan.header.T_platform_sensor is not None for scan in scans):
+            warnings.append("the mount counts as exact: give `mount`, or state poses whose uncertainty contains it")
     known = read_stored_estimate(prior, header.sensor, header.medium)
     root, by_stage = independent_components(known, prior, header)
-    stated = header.sensor.uncertainty
+    stated, on_platform = header.sensor.uncertainty, None
+    if mount is not None:
+        root, by_stage, on_platform = _add_mount(mount, prior, root, by_stage)
+    scale = stated.stage_scale if mount is None or mount.robot_scale_std is None else mount.robot_scale_std
     problem = PassProblem(
         gathered,
         known,
@@ -292,38 +333,50 @@ def recalibrate(
         np.array(prior.stage_direction_of(header.stage_direction)),
         window_shift_std_mm(header.sensor),
         header.medium.index_per_kelvin(header.sensor.laser.wavelength_nm) * stated.drift_k,
-        MotionUncertainty(pose_std_mm, float(np.radians(pose_std_deg)), stated.stage_scale, stated.stage_position_mm),
+        MotionUncertainty(pose_std_mm, float(np.radians(pose_std_deg)), scale, stated.stage_position_mm),
         np.vstack([each.pose[:, :3, 3] for each in gathered]).mean(axis=0),
+        on_platform,
     )
     start = problem.place(np.zeros(problem.unknowns), [np.zeros(len(each.line)) for each in gathered])
     radius = max(find_disc_radius(start.places_mm[start.number == each]) for each in range(len(gathered)))
     solution = solve_passes(problem, size_mm=CELL * radius, artefact=artefact)
     progress(len(scans) + 1, len(scans) + 1)
-    return replace(summarise(problem, solution, prior, header.stage_direction), warnings=tuple(warnings))
+    found = summarise(problem, solution, prior, header.stage_direction)
+    moved = None if mount is None else move_mount(mount, problem, solution, found.calibration)
+    return replace(found, warnings=tuple(warnings), mount=moved)
 
 
 def _gather(
-    scan: Capture, prior: Calibration, pose: np.ndarray | None, stripe: StripeSettings
-) -> tuple[Pass, list[str]]:
-    """Return the stripe centres of a capture, with the noise of each and the place of each image, and warnings."""
-    of_frames = sensor_poses(scan)
+    scan: Capture,
+    table: Capture | FrameTable,
+    rates: np.ndarray | None,
+    prior: Calibration,
+    pose: np.ndarray | None,
+    stripe: StripeSettings,
+) -> tuple[list[Pass], list[str]]:
+    """Return the passes of a capture, and warnings.
+
+    ``table`` are its images with the poses of a platform, if there is one, with its ``rates`` (F, 6).
+    """
+    of_frames = sensor_poses(table)
     posed = np.asarray(np.isfinite(of_frames).all(axis=(1, 2)))
     if pose is None and not posed[scan.laser_on].all():
         raise CaptureError(f"{scan.path.name} has no poses of its images: give the pose of each pass (`poses`)")
     stripes = find_stripes(scan, options=stripe)
     sharp, blur = select_sharp_lines(stripes)
     stripes = stripes[sharp]
-    cloud = reconstruct_stripes(scan, stripes, prior)
+    cloud = reconstruct_stripes(table, stripes, prior)
     key = stripes.frame.astype(np.int64) * (1 + int(stripes.line.max())) + stripes.line
     wanted = cloud.frame.astype(np.int64) * (1 + int(stripes.line.max())) + cloud.line
     order = np.argsort(key)
     chosen = order[np.searchsorted(key[order], wanted)]
     kept, blur = stripes[chosen], blur[chosen]
     noise = estimate_stripe_noise_px(kept.frame, kept.line, kept.centre_px)
+    pass_of = split_passes(cloud) if pose is None else np.zeros(len(cloud.frame), int)
     # At edges, blur and brightness shift the centres by amounts that are known roughly.
-    few = np.flatnonzero((np.abs(blur) < _SHIFTED * noise) & (kept.line % LINES == 0))
+    few = np.flatnonzero((np.abs(blur) < _SHIFTED * noise) & (kept.line % LINES == 0) & (pass_of >= 0))
     few = few[:: max(1, len(few) // _MOST_POINTS)]
-    kept, noise, points = kept[few], noise[few], cloud.points_mm[few]
+    kept, noise, points, pass_of = kept[few], noise[few], cloud.points_mm[few], pass_of[few]
     of_images = np.where(posed[:, None, None], of_frames, np.eye(4))
     travel = np.where(posed, 0.0, scan.stage_mm)[kept.frame]
     known = read_stored_estimate(prior, scan.header.sensor, scan.header.medium)
@@ -335,20 +388,47 @@ def _gather(
     # `reconstruct` adds the shift to the origin of the light, and motion during the exposure.
     beside = np.einsum("nji,nj->ni", rotation, points - origin) - found[0] - travel[:, None] * direction
     even = np.linalg.norm(beside, axis=1) < _SHIFTED * noise * np.linalg.norm(found[1][:, :, 0], axis=1)
-    found_pass = Pass(
-        scan.path.name,
-        kept.frame[even],
-        kept.line[even],
-        kept.centre_px[even].astype(np.float64),
-        noise[even],
-        beside[even],
-        travel[even],
-        of_images if pose is None else pose @ of_images,
-    )
-    warnings = list(cloud.warnings)
-    if scan.header.T_platform_sensor is not None:
-        warnings.append("the mount counts as exact: the stated uncertainty of the poses must contain that of the mount")
-    return found_pass, warnings
+    own = of_images if pose is None else pose @ of_images
+    if rates is not None:
+        # The rates are those of the platform's origin.
+        lever = own[:, :3, 3] - table.pose[:, :3, 3]
+        rates = np.hstack([rates[:, :3] + np.cross(rates[:, 3:], lever), rates[:, 3:]])
+    passes, numbers = [], np.unique(pass_of)
+    for number in numbers:
+        some = even & (pass_of == number)
+        passes.append(
+            Pass(
+                scan.path.name if len(numbers) == 1 else f"{scan.path.name}, pass {number + 1}",
+                kept.frame[some],
+                kept.line[some],
+                kept.centre_px[some].astype(np.float64),
+                noise[some],
+                beside[some],
+                travel[some],
+                own,
+                rates,
+            )
+        )
+    return passes, list(cloud.warnings)
+
+
+def _add_mount(
+    mount: Mount, prior: Calibration, root: np.ndarray, by_stage: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, MountErrors]:
+    """Return the components with those of a mount and of its clock, before the last one, and the errors of the mount.
+
+    A mount that was estimated with the same calibration has a part of its errors in common with it.
+    """
+    apart, common = mount.independent_covariance(calibration_digest(prior))
+    own = np.zeros((7, 7))
+    own[:6, :6], own[6, 6] = CovarianceRoot.from_covariance(apart).root, mount.time_offset_std_s or 0.0
+    by = np.zeros((7, root.shape[1]))
+    if common is not None:
+        by[:6] = common @ root[: common.shape[1]]
+    at = np.full(7, root.shape[1] - 1)
+    by = np.insert(by, at, 0.0, axis=1)
+    by[:, at[0] : at[0] + 7] = own
+    return (np.insert(root, at, 0.0, axis=1), np.insert(by_stage, at, 0.0, axis=0), MountErrors(mount.transform(), by))
 
 
 def summarise(

@@ -50,6 +50,7 @@ def write_recalibration(
         doubts=found.doubts,
         warnings=found.warnings,
         parameters=[_row(each) for each in sorted(found.parameters, key=lambda each: each.std / each.std_before)],
+        mount=found.mount.lines() if found.mount else [],
         next_passes=[
             (each.candidate.words, f"{each.before:.3f}", f"{each.after:.3f}")
             for each in found.next_passes[:6]
