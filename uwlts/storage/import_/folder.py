@@ -15,6 +15,7 @@ from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import CAPTURES, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.image_file import ImageHeader, read_image
+from uwlts.storage.import_.bag_images import is_bag, unpack_images
 from uwlts.storage.import_.centre_lines import profile_rows
 from uwlts.storage.import_.folder_description import (
     NAME,
@@ -172,7 +173,7 @@ def import_images(
     overwrite: bool = False,
     progress: ProgressListener = ignore_progress,
 ) -> Imported:
-    """Convert a folder of images of any camera to a capture, written completely or not at all.
+    """Convert a folder or a ROS bag of images of any camera to a capture, written completely or not at all.
 
     If laser images have a background, all images are stored with 16 bit. The laser images are then the difference plus
     2^bits, which keeps the sign of the noise about zero.
@@ -180,11 +181,13 @@ def import_images(
     Parameters
     ----------
     folder : str or Path
-        Folder of PNG, TIFF, BMP or JPEG images; subfolders are included.
+        Folder of PNG, TIFF, BMP or JPEG images; subfolders are included. Or a bag of ROS with images, which count as
+        files TOPIC/NUMBER.png (or .jpg) with the times of their headers.
     out : str or Path
         Capture to write.
     description : str or Path, optional
-        TOML file with sensor, medium, positions and the role of each image; by default import.toml in the folder.
+        TOML file with sensor, medium, positions and the role of each image; by default import.toml in the folder. A
+        bag needs one.
     overwrite : bool
         Replace an existing capture.
     progress : callable
@@ -204,13 +207,31 @@ def import_images(
         depth, has an alpha channel, or has several colours without a selected channel; or all images are black.
     OutputError
         The capture cannot be written.
+    SetupError
+        The library for bags is not installed.
     """
     folder, out = Path(folder), Path(out)
     refuse_unsuitable(out, overwrite=overwrite, endings=CAPTURES)
-    if not folder.is_dir():
+    if not (bag := is_bag(folder)) and not folder.is_dir():
         raise ImageError(f"no folder at {folder}")
     path = folder / NAME if description is None else Path(description)
-    given = read_description(path)
+    given, name = read_description(path), folder.resolve().name
+    if not bag:
+        return _import_folder(folder, name, out, given, path, overwrite, progress)
+    with unpack_images(folder, given, out.parent) as (unpacked, completed):
+        return _import_folder(unpacked, name, out, completed, path, overwrite, progress)
+
+
+def _import_folder(
+    folder: Path,
+    name: str,
+    out: Path,
+    given: ImportDescription,
+    path: Path,
+    overwrite: bool,
+    progress: ProgressListener,
+) -> Imported:
+    """Convert a folder of images with a description, read from ``path``; ``name`` is that of the capture."""
     sensor = described_sensor(given, beside=path.parent)
     rows = None if given.table is None else read_rows(path.parent / given.table)
     matched = match(folder, given, rows)
@@ -230,9 +251,9 @@ def import_images(
         given,
         sensor,
         beside=path.parent,
-        name=folder.resolve().name,
+        name=name,
         saturation_dn=2 * zero - 1 if zero else saturation,
-        remarks=_remarks(given, frames, folder, bits=bits, zero_dn=zero),
+        remarks=_remarks(given, frames, name, bits=bits, zero_dn=zero),
     )
     saturation = reader.saturation_dn = saturation if given.header is None else header.saturation_dn
     if images and saturation > np.iinfo(reader.dtype).max:
@@ -353,9 +374,9 @@ class _Reader:
         return self._kept[1]
 
 
-def _remarks(given: ImportDescription, frames: list[ImageRow], folder: Path, *, bits: int, zero_dn: int) -> Table:
+def _remarks(given: ImportDescription, frames: list[ImageRow], folder: str, *, bits: int, zero_dn: int) -> Table:
     """Return the provenance of the capture."""
-    remarks: Table = {"source": "imported images", "uwlts": __version__, "folder": folder.resolve().name}
+    remarks: Table = {"source": "imported images", "uwlts": __version__, "folder": folder}
     remarks |= {"bits": bits, "stage": stage_remark(given)}
     remarks |= {
         key: getattr(given, key) for key in ("bayer", "channel", "lamp_channel", "intrinsics") if getattr(given, key)

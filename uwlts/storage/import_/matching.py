@@ -163,9 +163,9 @@ def match(folder: Path, given: ImportDescription, rows: list[ImageRow] | None) -
         laser, lamp = ([row for row in known if row.light in (light, "both")] for light in ("laser", "lamp"))
         ignored = [row for row in known if row.light == "ignore"]
     else:
-        ignored = [row for row in known if _matches(row.file, given.ignore)]
-        used = [row for row in known if not _matches(row.file, given.ignore)]
-        laser, lamp = ([row for row in used if _matches(row.file, light)] for light in (given.laser, given.lamp))
+        ignored = [row for row in known if matches(row.file, given.ignore)]
+        used = [row for row in known if not matches(row.file, given.ignore)]
+        laser, lamp = ([row for row in used if matches(row.file, light)] for light in (given.laser, given.lamp))
         lit, under_lamp = {row.file for row in laser}, {row.file for row in lamp}
         _refuse_any(
             [] if lit == under_lamp else sorted(lit & under_lamp),
@@ -180,17 +180,17 @@ def match(folder: Path, given: ImportDescription, rows: list[ImageRow] | None) -
         )
     laser = _add_backgrounds(
         folder,
-        [name for name in files if _matches(name, given.background) and not _matches(name, given.ignore)],
+        [name for name in files if matches(name, given.background) and not matches(name, given.ignore)],
         given,
         laser,
     )
     described = {name for row in (*laser, *lamp, *ignored) for name in (row.file, row.background)}
     described |= {given.table, given.centre_lines.table if given.centre_lines else None}
-    unmatched = [name for name in files if name not in described and not _matches(name, given.ignore)]
+    unmatched = [name for name in files if name not in described and not matches(name, given.ignore)]
     return Matched(laser, lamp, unmatched)
 
 
-def _matches(name: str, patterns: Patterns) -> bool:
+def matches(name: str, patterns: Patterns) -> bool:
     """Return whether a path relative to the folder, or its last part, matches a pattern."""
     wanted = (patterns,) if isinstance(patterns, str) else patterns
     return any(fnmatch(name, pattern) or fnmatch(PurePosixPath(name).name, pattern) for pattern in wanted)
