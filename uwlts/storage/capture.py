@@ -37,9 +37,9 @@ from uwlts.model.sensor import Camera, CaptureHeader, Table
 from uwlts.model.stripe import ROWS, Stripe, StripeStatus
 from uwlts.storage.hdf5_file import (
     DAMAGE,
-    UnfinishedFile,
     find_dataset,
     has_writer,
+    open_unfinished,
     read_label,
     read_plan,
     read_values,
@@ -215,7 +215,7 @@ class Capture(AbstractContextManager["Capture"]):
         require_regular_file(self.path, called="capture")
         try:
             unfinished = not self.finished or has_writer(self.path)
-            self.file = UnfinishedFile(self.path) if unfinished else h5py.File(self.path, "r")
+            self.file = open_unfinished(self.path) if unfinished else h5py.File(self.path, "r")
         except DAMAGE as error:
             raise CaptureError(f"{self.path} is not a capture, or is truncated: {_what_is_wrong(error)}") from error
         try:

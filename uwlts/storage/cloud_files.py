@@ -27,15 +27,16 @@ from uwlts.storage.cloud import (
     STEP,
     PointCloud,
     PointUncertainty,
+    compute_normal_std,
     concatenate_clouds,
     find_float_step,
     metadata_json,
     note_step,
     omit_points,
 )
-from uwlts.storage.foreign_clouds import FORMATS, find_format, read_foreign, require_libraries, write_foreign
+from uwlts.storage.foreign_clouds import FORMATS, find_format
 from uwlts.storage.hdf5_file import DAMAGE, find_dataset, read_array, read_format, read_label, write_label
-from uwlts.storage.normal_std import compute_normal_std
+from uwlts.storage.las_file import load_library
 from uwlts.storage.number_tables import Unit, choose_scale, find_stated_unit
 from uwlts.storage.ply import encode_ply, read_comments, read_ply
 from uwlts.storage.repeated_points import omit_repeated
@@ -89,8 +90,11 @@ def write_cloud(
     """
     path = Path(path)
     require_ending(path, CLOUD_FORMATS if colours is None else COLOURED_FORMATS)
-    if find_format(path) is not None:
-        write_foreign(path, cloud, overwrite=overwrite, colours=colours)
+    if (form := find_format(path)) is not None and form.write is not None:
+        if len(cloud) == 0:
+            raise OutputError(f"the cloud has no points, and {path.suffix} cannot hold none: write PLY or HDF5")
+        with write_atomically(path, overwrite=overwrite) as aside:
+            form.write(aside, cloud, colours, path)
         return
     if _in_hdf5(path):
         _write_hdf5(path, cloud, overwrite=overwrite)
@@ -132,7 +136,9 @@ def refuse_unsuitable_cloud(path: str | os.PathLike[str], *, overwrite: bool, co
     path = Path(path)
     refuse_unsuitable(path, overwrite=overwrite)
     require_ending(path, COLOURED_FORMATS if coloured else CLOUD_FORMATS)
-    require_libraries(path)
+    form = find_format(path)
+    for name in () if form is None else form.libraries:
+        load_library(name, path.suffix.strip(".").upper())
 
 
 def read_cloud(path: str | os.PathLike[str], *, unit: Unit | None = None) -> PointCloud:
@@ -174,8 +180,8 @@ def read_thinned_cloud(
     For HDF5 and binary PLY only these are held in memory.
     """
     with _naming(path):
-        if find_format(path) is not None:
-            whole = read_foreign(Path(path), unit=unit)
+        if (form := find_format(path)) is not None:
+            whole = form.read(Path(path), unit)
             cloud, total = whole.select(_every(len(whole), at_most)), len(whole)
         else:
             cloud, total = _read_rows(Path(path), lambda count: _every(count, at_most))
@@ -309,27 +315,19 @@ def _in_hdf5(path: str | os.PathLike[str]) -> bool:
     return Path(path).suffix.lower() == ".h5"
 
 
-def _move_names(patterns: int) -> list[str]:
-    return [f"{move}_{axis}" for move in ("position", *(f"pattern{m}" for m in range(patterns))) for axis in "xyz"]
-
-
 def _uncertainty_columns(uncertainty: PointUncertainty | None) -> dict[str, np.ndarray]:
     """Return columns (N,) float32 by the names of their vertex properties."""
     if uncertainty is None:
         return {}
-    names = [f"{kind}_{pair}" for kind in ("random", "systematic") for pair in _PAIR_NAMES]
-    names += _move_names(len(uncertainty.patterns_mm))
-    patterns = np.moveaxis(uncertainty.patterns_mm, 2, 1).reshape(-1, len(uncertainty.random_mm2))
-    parts = uncertainty.random_mm2.T, uncertainty.systematic_mm2().T, uncertainty.position_mm.T, patterns
-    columns = dict(zip(names, np.vstack(parts).astype(np.float32), strict=True))
-    if uncertainty.poses_mm is not None:
-        poses = np.moveaxis(uncertainty.poses_mm, 2, 1).reshape(-1, len(uncertainty.random_mm2))
-        columns |= dict(zip(_pose_names(len(uncertainty.poses_mm)), poses.astype(np.float32), strict=True))
-    return columns
-
-
-def _pose_names(count: int) -> list[str]:
-    return [f"pose{k}_{axis}" for k in range(count) for axis in "xyz"]
+    parts = {"random": uncertainty.random_mm2, "systematic": uncertainty.systematic_mm2()}
+    columns = {
+        f"{part}_{pair}": each for part, each in parts.items() for pair, each in zip(_PAIR_NAMES, each.T, strict=True)
+    }
+    moves = {"position": uncertainty.position_mm}
+    for part, several in (("pattern", uncertainty.patterns_mm), ("pose", uncertainty.poses_mm)):
+        moves |= {f"{part}{k}": move for k, move in enumerate(() if several is None else several)}
+    columns |= {f"{name}_{axis}": move[:, k] for name, move in moves.items() for k, axis in enumerate("xyz")}
+    return {name: values.astype(np.float32) for name, values in columns.items()}
 
 
 def _with_shared(cloud: PointCloud) -> Table:
@@ -384,23 +382,18 @@ def _metadata(comments: list[str]) -> Table:
 def _read_uncertainty(names: Mapping[str, str], column: Callable[[str], np.ndarray]) -> PointUncertainty | None:
     """Return the uncertainty in columns ``names``; None without all of them."""
     count, parts = (sum(f"{part}{k}_x" in names for k in range(len(names))) for part in ("pattern", "pose"))
-    wanted = [f"random_{pair}" for pair in _PAIR_NAMES] + _move_names(count)
-    if not count or not all(name in names for name in wanted):
+    wanted = [[f"random_{pair}" for pair in _PAIR_NAMES]]
+    wanted += [[f"{move}_{axis}" for axis in "xyz"] for move in ("position", *(f"pattern{k}" for k in range(count)))]
+    if not count or not all(name in names for each in wanted for name in each):
         return None
-    columns = np.stack([column(name) for name in wanted])
-    random, position = columns[:6].T.copy(), columns[6:9].T.copy()
-
-    def vectors(rows: np.ndarray) -> np.ndarray:
-        return np.ascontiguousarray(np.moveaxis(rows.reshape(len(rows) // 3, 3, -1), 1, 2))
-
-    poses = None
-    if parts and all(name in names for name in _pose_names(parts)):
-        poses = vectors(np.stack([column(name) for name in _pose_names(parts)]))
-    return PointUncertainty(random, position, vectors(columns[9:]), poses_mm=poses)
+    random, position, *patterns = (np.column_stack([column(name) for name in each]) for each in wanted)
+    turned = [[f"pose{k}_{axis}" for axis in "xyz"] for k in range(parts)]
+    known = parts and all(name in names for each in turned for name in each)
+    poses = np.stack([np.column_stack([column(name) for name in each]) for each in turned]) if known else None
+    return PointUncertainty(random, position, np.stack(patterns), poses_mm=poses)
 
 
-def _read_vertices(path: Path) -> tuple[np.ndarray, list[str]]:
-    """Return the vertices of a PLY file as a structured array, and the comments."""
+def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     try:
         whole, comments = read_ply(path, "vertex", called="cloud")
     except OSError as error:
@@ -409,11 +402,6 @@ def _read_vertices(path: Path) -> tuple[np.ndarray, list[str]]:
         raise CaptureError(f"{path} does not fit into the memory") from error
     if whole is None:
         raise CaptureError(f"{path} is a PLY file without vertices; expected an element 'vertex'")
-    return whole, comments
-
-
-def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
-    whole, comments = _read_vertices(path)
     vertices, names = whole[rows(len(whole))], whole.dtype.names or ()
     known = {name.lower().removeprefix("scalar_"): name for name in names} | {name: name for name in names}
     if missing := [axis for axis in "xyz" if axis not in known]:

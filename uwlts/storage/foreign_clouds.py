@@ -9,11 +9,9 @@ from typing import Literal
 import numpy as np
 
 from uwlts.errors import CaptureError, DescriptionError, OutputError
-from uwlts.files.writing import write_atomically
-from uwlts.storage.cloud import PointCloud, find_float_step, make_foreign_cloud
+from uwlts.storage.cloud import PointCloud, compute_normal_std, find_float_step, make_foreign_cloud
 from uwlts.storage.e57_file import COLOURS, read_e57, write_e57
-from uwlts.storage.las_file import encode_las, load_library, read_las
-from uwlts.storage.normal_std import compute_normal_std
+from uwlts.storage.las_file import encode_las, read_las
 from uwlts.storage.number_tables import Unit, read_number_table
 from uwlts.storage.point_cloud2 import covariance_columns, mcap_content, read_bag_cloud
 
@@ -40,19 +38,6 @@ def find_format(path: str | os.PathLike[str]) -> CloudFormat | None:
     return FORMATS.get(Path(path).suffix.lower())
 
 
-def read_foreign(path: Path, *, unit: Unit | None = None) -> PointCloud:
-    """Read all points of a file in one of `FORMATS`.
-
-    Text is in the unit that the names of its columns state, else in ``unit``, by default mm; LAS,
-    LAZ and E57 are in m, as they prescribe. The scans of an E57 file are combined, each at its pose.
-
-    Raises CaptureError if the file is damaged or foreign, SetupError if the library for its format is not installed.
-    """
-    form = find_format(path)
-    assert form is not None
-    return form.read(path, unit)
-
-
 def _read_text(path: Path, unit: Unit | None) -> PointCloud:
     try:
         table = read_number_table(path, named=False)
@@ -68,27 +53,6 @@ def _read_text(path: Path, unit: Unit | None) -> PointCloud:
     step = scale * max(find_float_step(points), *(table.steps.get(name, 0.0) for name in used))
     cloud = make_foreign_cloud(scale * points, intensity=columns.get("intensity"), step_mm=step)
     return replace(cloud, warnings=[*table.notes, *cloud.warnings])
-
-
-def write_foreign(path: Path, cloud: PointCloud, *, overwrite: bool, colours: Colours = None) -> None:
-    """Write a cloud in one of `FORMATS`, by the path's ending, completely or not at all.
-
-    Raises OutputError if the file exists, the cloud is empty, too wide for LAS, or lacks some intensities in E57, or
-    writing fails; SetupError if the format's library is not installed.
-    """
-    if len(cloud) == 0:
-        raise OutputError(f"the cloud has no points, and {path.suffix} cannot hold none: write PLY or HDF5")
-    form = find_format(path)
-    assert form is not None and form.write is not None
-    with write_atomically(path, overwrite=overwrite) as aside:
-        form.write(aside, cloud, colours, path)
-
-
-def require_libraries(path: Path) -> None:
-    """Raise SetupError if a library for writing a file with this ending is not installed."""
-    form = find_format(path)
-    for name in () if form is None else form.libraries:
-        load_library(name, path.suffix.strip(".").upper())
 
 
 def _write_text(aside: Path, cloud: PointCloud, colours: Colours, path: Path) -> None:
@@ -147,4 +111,5 @@ FORMATS = {
     ".csv": CloudFormat(_read_text, ambiguous=True),
     ".asc": CloudFormat(_read_text, ambiguous=True),
 }
-"""Formats by the file's ending. Text has columns x, y, z by name, or the first three, and optionally intensity."""
+"""Formats by the file's ending. Text has columns x, y, z by name, or the first three, and optionally intensity. Its unit
+is that in these names, else the given one, by default mm."""
