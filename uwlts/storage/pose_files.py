@@ -13,7 +13,7 @@ from uwlts.files.writing import write_atomically
 from uwlts.model.calibration import is_rigid
 from uwlts.model.trajectory import COVARIANCE_COLUMNS, Trajectory
 from uwlts.storage.number_tables import ROTATION_NAMES, NumberTable, Unit, read_number_table
-from uwlts.storage.ros_bags import read_bag_poses
+from uwlts.storage.ros_messages import read_bag_poses
 
 PoseFormat = str
 """matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ORDER-deg or -rad, angle-deg,
@@ -73,7 +73,7 @@ def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", uni
     the quaternion x y z w, separated by blanks and without names. Columns named ``cov_00`` to ``cov_55`` are the upper
     triangles of the covariances (`Trajectory`), in the unit of the positions and rad. With the format ``ros`` the file
     is a bag of ROS 1 or ROS 2; ``ros:/TOPIC`` or ``ros:PARENT>CHILD`` names the poses or transforms in it
-    (`uwlts.storage.ros_bags`).
+    (`uwlts.storage.ros_messages`).
 
     Raises the errors of `read_poses` and `Trajectory`, DescriptionError if there are no times, and SetupError if the
     library for bags is not installed.
