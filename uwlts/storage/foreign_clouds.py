@@ -71,25 +71,19 @@ def _write_text(aside: Path, cloud: PointCloud, colours: Colours, path: Path) ->
 
 
 def _write_las(aside: Path, cloud: PointCloud, colours: Colours, path: Path) -> None:
-    fields = {"amplitude": cloud.intensity, "frame": cloud.frame, "line": cloud.line}
-    if cloud.deviation_mm is not None:
-        fields["deviation_mm"] = cloud.deviation_mm
-    fields |= _uncertainty_columns(cloud)
+    random, common = compute_normal_std(cloud)
+    fields = {
+        "amplitude": cloud.intensity,
+        "frame": cloud.frame,
+        "line": cloud.line,
+        "deviation_mm": cloud.deviation_mm,
+    }
+    fields |= covariance_columns(cloud) | {"random_std_mm": random, "common_std_mm": common}
+    known = {name: values for name, values in fields.items() if values is not None}
     compressed = path.suffix.lower() == ".laz"
-    content = encode_las(
-        cloud.points_mm, cloud.intensity, fields, time_s=cloud.time_s, colours=colours, compressed=compressed
+    aside.write_bytes(
+        encode_las(cloud.points_mm, cloud.intensity, known, time_s=cloud.time_s, colours=colours, compressed=compressed)
     )
-    aside.write_bytes(content)
-
-
-def _uncertainty_columns(cloud: PointCloud) -> dict[str, np.ndarray]:
-    """Return the known columns (N,) of the covariance, and of the random and common part along the surface normal."""
-    parts = zip(("random_std_mm", "common_std_mm"), compute_normal_std(cloud), strict=True)
-    return covariance_columns(cloud) | {name: values for name, values in parts if values is not None}
-
-
-def _write_mcap(aside: Path, cloud: PointCloud, colours: Colours, path: Path) -> None:
-    aside.write_bytes(mcap_content(cloud))
 
 
 def _write_e57(aside: Path, cloud: PointCloud, colours: Colours, path: Path) -> None:
@@ -172,7 +166,9 @@ FORMATS = {
     ".laz": CloudFormat(read_las, _write_las, libraries=("laspy", "lazrs"), coloured=True, unit="m"),
     ".e57": CloudFormat(_read_e57, _write_e57, libraries=("pye57",), coloured=True, unit="m"),
     ".las": CloudFormat(read_las, _write_las, libraries=("laspy",), coloured=True, unit="m"),
-    ".mcap": CloudFormat(read_bag_cloud, _write_mcap, unit="m", ambiguous=True),
+    ".mcap": CloudFormat(
+        read_bag_cloud, lambda aside, cloud, *_: aside.write_bytes(mcap_content(cloud)), unit="m", ambiguous=True
+    ),
     ".bag": CloudFormat(read_bag_cloud, unit="m", ambiguous=True),
     ".txt": CloudFormat(_read_text, ambiguous=True),
     ".csv": CloudFormat(_read_text, ambiguous=True),

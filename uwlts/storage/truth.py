@@ -86,9 +86,8 @@ def write_truth(path: str | Path, header: TruthHeader, truth: Truth, *, overwrit
     with write_atomically(path, overwrite=overwrite) as aside, h5py.File(aside, "w", libver="latest") as file:
         write_label(file, file_format=FORMAT, version=VERSION, header=header)
         for name, values in vars(truth).items():
-            if values is None:
-                continue
-            file.create_dataset(name, data=values, compression="gzip", compression_opts=1, fletcher32=True)
+            if values is not None:
+                file.create_dataset(name, data=values, compression="gzip", compression_opts=1, fletcher32=True)
 
 
 def read_truth(path: str | Path) -> tuple[TruthHeader, Truth]:
