@@ -5,7 +5,6 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,6 @@ from uwlts.storage.cloud import (
     FARTHEST_SINGLE_MM,
     KINDS,
     NO_INDEX,
-    OPTIONAL,
     PAIRS,
     PER_POINT,
     STEP,
@@ -35,7 +33,7 @@ from uwlts.storage.cloud import (
     omit_points,
 )
 from uwlts.storage.foreign_clouds import FORMATS, find_format
-from uwlts.storage.hdf5_file import DAMAGE, find_dataset, read_array, read_format, read_label, write_label
+from uwlts.storage.hdf5_file import DAMAGE, find_dataset, read_array, read_format, read_label, write_arrays
 from uwlts.storage.las_file import load_library
 from uwlts.storage.number_tables import Unit, choose_scale, find_stated_unit
 from uwlts.storage.ply import encode_ply, read_comments, read_ply
@@ -61,6 +59,7 @@ _LEAN = (
     f"have no uncertainty. Use the cloud in HDF5 (NAME.h5) or in PLY with the whole uncertainty (NAME{FULL})"
 )
 _UNCERTAINTY = ["random_mm2", "position_mm", "patterns_mm", "poses_mm"]
+"""Arrays of `PointUncertainty` in HDF5, of which clouds may lack the last one."""
 _PAIR_NAMES = tuple("xyz"[i] + "xyz"[j] for i, j in PAIRS)
 _SHARED = "shared_errors"
 _COMMENT = "uwlts-metadata"
@@ -97,7 +96,11 @@ def write_cloud(
             form.write(aside, cloud, colours, path)
         return
     if _in_hdf5(path):
-        _write_hdf5(path, cloud, overwrite=overwrite)
+        arrays, known = {name: getattr(cloud, name) for name in KINDS}, cloud.uncertainty
+        if known is not None:
+            arrays |= {name: getattr(known, name) for name in _UNCERTAINTY} | {"systematic_mm2": known.systematic_mm2()}
+        header = _CloudHeader(metadata=_with_shared(cloud))
+        write_arrays(path, arrays, file_format=FORMAT, version=VERSION, header=header, overwrite=overwrite)
         return
     single = str(path).lower().endswith(SINGLE)
     if single and np.abs(cloud.points_mm).max(initial=0.0) > FARTHEST_SINGLE_MM:
@@ -454,52 +457,30 @@ class _CloudHeader(Description):
     metadata: Table
 
 
-def _write_hdf5(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: bool) -> None:
-    arrays = {name: getattr(cloud, name) for name in PER_POINT}
-    arrays |= {name: each for name in OPTIONAL if (each := getattr(cloud, name)) is not None}
-    if cloud.uncertainty is not None:
-        arrays |= {name: each for name in _UNCERTAINTY if (each := getattr(cloud.uncertainty, name)) is not None}
-        arrays["systematic_mm2"] = cloud.uncertainty.systematic_mm2()
-    # Written in memory first: HDF5 does not survive a full disk.
-    content = BytesIO()
-    with h5py.File(content, "w", libver="latest") as file:
-        write_label(file, file_format=FORMAT, version=VERSION, header=_CloudHeader(metadata=_with_shared(cloud)))
-        for name, data in arrays.items():
-            file.create_dataset(name, data=data, compression="gzip", compression_opts=1, shuffle=True, fletcher32=True)
-    with write_atomically(path, overwrite=overwrite) as aside:
-        aside.write_bytes(content.getbuffer())
-
-
 def _read_hdf5(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     require_regular_file(path, called="cloud")
-    names = _UNCERTAINTY
     try:
         with h5py.File(path, "r") as file:
             header = read_label(file, _CloudHeader, path=path, file_format=FORMAT, version=VERSION)
             points = find_dataset(file, "points_mm", path=path)
             total = 0 if points is None or not points.ndim else len(points)
             chosen = rows(total)
-            selection: dict[str, tuple[slice, ...]] = dict.fromkeys((*KINDS, *names), (chosen,))
-            selection["patterns_mm"] = selection["poses_mm"] = (slice(None), chosen)
-            found = {name: read_array(file, name, path=path, selection=selection[name]) for name in selection}
+            selection = dict.fromkeys((*KINDS, *_UNCERTAINTY), (chosen,))
+            selection |= dict.fromkeys(("patterns_mm", "poses_mm"), (slice(None), chosen))
+            found = {name: read_array(file, name, path=path, selection=each) for name, each in selection.items()}
     except DAMAGE as error:
         raise CaptureError(f"{path} is not a complete HDF5 file of a cloud: {error}") from error
-    arrays = {name: values for name, values in found.items() if values is not None}
+    arrays: dict[str, Any] = {name: values for name, values in found.items() if values is not None}
     # Conversion must not truncate integers, nor round fractions.
     wanted_kinds = {name: np.dtype(KINDS.get(name, np.float32)).kind for name in arrays}
     if unusable := [name for name, values in arrays.items() if values.dtype.kind != wanted_kinds[name]]:
         raise CaptureError(f"{path} is damaged: {', '.join(unusable)} are no numbers of the expected kind")
-    if unusable := [
-        n for n in ("frame", "line") if n in arrays and (np.abs(arrays[n].astype(np.float64)) >= 2**31).any()
-    ]:
+    integers = [name for name in ("frame", "line") if name in arrays]
+    if unusable := [name for name in integers if (np.abs(arrays[name].astype(np.float64)) >= 2**31).any()]:
         raise CaptureError(f"{path} is damaged: {', '.join(unusable)} has values of more than 32 bits")
-    needed = [name for name in names if name != "poses_mm"]
-    wanted = [*PER_POINT, *(needed if any(name in arrays for name in names) else ())]
-    if missing := [name for name in wanted if name not in arrays]:
+    parts = {name: arrays.pop(name) for name in _UNCERTAINTY if name in arrays}
+    wanted = [*PER_POINT, *(_UNCERTAINTY[:-1] if parts else ())]
+    if missing := [name for name in wanted if name not in arrays | parts]:
         raise CaptureError(f"{path} is damaged: it has no {', '.join(missing)}")
-    known = None
-    if needed[0] in arrays:
-        known = PointUncertainty(*(arrays[name] for name in needed), poses_mm=arrays.get("poses_mm"))
-    per_point: dict[str, Any] = {name: arrays[name] for name in KINDS if name in arrays}
-    metadata, known = _without_shared(header.metadata, known)
-    return PointCloud(**per_point, uncertainty=known, metadata=metadata), total
+    metadata, known = _without_shared(header.metadata, PointUncertainty(**parts) if parts else None)
+    return PointCloud(**arrays, uncertainty=known, metadata=metadata), total

@@ -8,16 +8,20 @@ import ctypes
 import json
 import math
 import os
+from collections.abc import Mapping
 from contextlib import suppress
+from io import BytesIO
 from pathlib import Path
 from types import EllipsisType
 from typing import TypeVar
 
 import h5py
 import numpy as np
+from pydantic import JsonValue
 
 from uwlts.errors import CaptureError, Error
 from uwlts.files.reading import MOST_JSON_BYTES, is_regular_file, parse_json
+from uwlts.files.writing import write_atomically
 from uwlts.model.library import validate_description
 from uwlts.model.sensor import Description, Table
 
@@ -42,6 +46,29 @@ def write_label(file: h5py.File, *, file_format: str, version: int, header: Desc
     file.attrs["header"] = np.bytes_(header.model_dump_json().encode())
 
 
+def write_arrays(
+    path: str | Path,
+    arrays: Mapping[str, np.ndarray | None],
+    *,
+    file_format: str,
+    version: int,
+    header: Description,
+    overwrite: bool,
+) -> None:
+    """Write a labelled file with compressed arrays, without those that are None, completely or not at all."""
+    # Written in memory first: HDF5 does not survive a full disk. Its latest format protects all metadata by checksums.
+    content = BytesIO()
+    with h5py.File(content, "w", libver="latest") as file:
+        write_label(file, file_format=file_format, version=version, header=header)
+        for name, data in arrays.items():
+            if data is not None:
+                file.create_dataset(
+                    name, data=data, compression="gzip", compression_opts=1, shuffle=True, fletcher32=True
+                )
+    with write_atomically(path, overwrite=overwrite) as aside:
+        aside.write_bytes(content.getbuffer())
+
+
 def read_label(
     file: h5py.File, model: type[AnyHeader], *, path: str | Path, file_format: str, version: int
 ) -> AnyHeader:
@@ -63,14 +90,18 @@ def read_label(
         raise CaptureError(f"{path} has version {number}; this program reads up to {version}: update it")
     if (header := _text(file, "header")) is None:
         raise CaptureError(f"{path} is damaged: its header is missing")
-    try:
-        content = parse_json(header)
-    except ValueError as error:
-        raise CaptureError(f"{path} is damaged: its header is not JSON: {error}") from error
+    content = _parse(header, f"{path} is damaged: its header")
     try:
         return validate_description(model, content, f"the header of {path}")
     except Error as error:
         raise CaptureError(str(error)) from error
+
+
+def _parse(text: str, called: str) -> JsonValue:
+    try:
+        return parse_json(text)
+    except ValueError as error:
+        raise CaptureError(f"{called} is not JSON: {error}") from error
 
 
 def write_plan(file: h5py.File, plan: Table) -> None:
@@ -82,10 +113,7 @@ def read_plan(file: h5py.File) -> Table | None:
     """Return the plan of an unfinished file, or None; raises CaptureError if it is damaged."""
     if (text := _text(file, "plan")) is None:
         return None
-    try:
-        plan = parse_json(text)
-    except ValueError as error:
-        raise CaptureError(f"{file.filename} is damaged: its plan is not JSON: {error}") from error
+    plan = _parse(text, f"{file.filename} is damaged: its plan")
     if not isinstance(plan, dict):
         raise CaptureError(f"{file.filename} is damaged: its plan is not a table")
     return plan

@@ -33,6 +33,8 @@ _FEWEST_POSES, _ALTERNATING, _RETURNED, _LEAST_JUMP_MM, _REACH_MM = 10, 0.2, 0.3
 and lever of rotations. Of independent noise along one axis, 14 % jump, in a plane 6 %."""
 _NEAR_HALF_TURN = 3.0
 """Angles in rad reach pi, unless turns are small; the largest in deg is between 3 and pi by chance only."""
+_METRES = np.array([1e3] * 3 + [1.0] * 3)
+"""Units of shifts in m and rotations in rad, in mm and rad."""
 _MOST_POSES = 1_000_000  # more than an hour at 200 poses a second
 _LATEST_S = 1e11  # Unix times in s reach it in the year 5138; larger numbers are in ms, us or ns
 
@@ -81,9 +83,7 @@ def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", uni
     path = Path(path)
     if pose_format == "ros" or pose_format.startswith("ros:"):
         times, rows, covariance = read_bag_poses(path, pose_format.removeprefix("ros").removeprefix(":"))
-        if covariance is not None:
-            units = np.array([1e3] * 3 + [1.0] * 3)
-            covariance = covariance * units[:, None] * units
+        covariance = None if covariance is None else covariance * np.outer(_METRES, _METRES)
         rows[:, :3] *= 1e3
         return _trajectory(path, times, poses_from_rows(rows, "quaternion-xyzw", path), covariance)
     table = read_number_table(path, named=False)
@@ -93,10 +93,8 @@ def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", uni
                 f"{path} has {len(table.columns)} columns; expected time, x, y, z and a quaternion (tum)"
             )
         if "time_s" not in table.columns:
-            first = next(iter(table.columns))
-            table = replace(
-                table, columns={"time_s" if name == first else name: c for name, c in table.columns.items()}
-            )
+            names = ["time_s", *[*table.columns][1:]]
+            table = replace(table, columns=dict(zip(names, table.columns.values(), strict=True)))
         pose_format, unit = "quaternion-xyzw", "m"
     covariance = _covariances(table.columns, path, table.mm_per_unit(unit=unit))
     poses, times = _poses(table, pose_format, unit)
@@ -138,7 +136,7 @@ def _covariances(columns: dict[str, np.ndarray], path: Path, mm_per_unit: float)
         return None
     if missing := sorted(COVARIANCE_COLUMNS.keys() - found.keys()):
         raise DescriptionError(f"{path} has columns of covariances, but not {', '.join(missing)}")
-    units = np.array([mm_per_unit] * 3 + [1.0] * 3)
+    units = np.where(_METRES > 1, mm_per_unit, 1.0)
     covariances = np.empty((len(next(iter(found.values()))), 6, 6))
     for name, (i, j) in COVARIANCE_COLUMNS.items():
         covariances[:, i, j] = covariances[:, j, i] = found[name] * units[i] * units[j]
