@@ -125,15 +125,11 @@ class FrameTable:
     @classmethod
     def from_frames(cls, header: CaptureHeader, frames: Sequence[Frame]) -> "FrameTable":
         """Return the table of frames in memory."""
-        none = np.full((4, 4), np.nan)
-        return cls(
-            header,
-            Path(header.name),
-            np.array([frame.stage_mm for frame in frames]),
-            np.array([frame.exposure_ms for frame in frames]),
-            np.array([none if frame.pose is None else frame.pose for frame in frames]).reshape(-1, 4, 4),
-            np.array([frame.speed_mm_per_s for frame in frames]),
+        stage, exposure, speed = (
+            np.array([(f.stage_mm, f.exposure_ms, f.speed_mm_per_s) for f in frames]).reshape(-1, 3).T
         )
+        poses = [np.full((4, 4), np.nan) if frame.pose is None else frame.pose for frame in frames]
+        return cls(header, Path(header.name), stage, exposure, np.array(poses).reshape(-1, 4, 4), speed)
 
 
 def sensor_poses(capture: "Capture | FrameTable") -> np.ndarray:
@@ -188,9 +184,9 @@ class Capture(AbstractContextManager["Capture"]):
         Whether the laser was on, rather than the lamp.
     pose : (N, 4, 4) float64
         ``T_scene_object`` of the sensor's OCS, a rotation with a shift; all NaN for a frame without one. It is that of
-            the platform, ``T_scene_platform``, if the header states ``T_platform_sensor``.
-        pose_covariance : (N, 6, 6) float64 or None
-            Covariance of each pose (`Frame`), all NaN if unknown; None in captures without any.
+        the platform, ``T_scene_platform``, if the header states ``T_platform_sensor``.
+    pose_covariance : (N, 6, 6) float64 or None
+        Covariance of each pose (`Frame`), all NaN if unknown; None in captures without any.
     has_image : (N,) bool
         Whether a frame is an image, rather than a centre line.
     encoder : (N,) float64

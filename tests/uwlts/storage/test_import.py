@@ -16,7 +16,7 @@ from uwlts.runtime.console import run
 from uwlts.storage.capture import NO_STAGE, Capture, part_path
 from uwlts.storage.export_ import export
 from uwlts.storage.image_file import SUFFIXES, read_image
-from uwlts.storage.import_ import import_images
+from uwlts.storage.import_.folder import import_images
 from uwlts.storage.import_.grey_values import extract_channel, grey_values
 from uwlts.storage.import_.matching import read_rows
 from uwlts.stripe import extract_stripe
