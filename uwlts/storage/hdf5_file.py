@@ -13,7 +13,7 @@ from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
 from types import EllipsisType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import h5py
 import numpy as np
@@ -82,7 +82,7 @@ def read_label(
     if found != file_format:
         called = "it has no format" if found is None else f"its format is {found!r}"
         raise CaptureError(f"{path} is HDF5, but not what is expected here: {called}, expected '{file_format}'")
-    number = _number(file, "version")
+    number = _attribute(file, "version", "iu")
     if number is None or number < 1:
         found = "no number" if number is None else number
         raise CaptureError(f"{path} is damaged: its version is {found}, expected a whole number from 1")
@@ -141,21 +141,17 @@ def read_format(path: str | Path) -> str | None:
 
 def _text(file: h5py.File, name: str) -> str | None:
     """Return an attribute's text, or None if it is missing or of another kind."""
-    if name not in file.attrs:
-        return None
-    known = file.attrs.get_id(name)
-    if known.dtype.kind != "S" or known.shape != () or known.dtype.itemsize > MOST_JSON_BYTES:
-        return None
-    value = file.attrs[name]
+    value = _attribute(file, name, "S")
     return value.decode() if isinstance(value, bytes) else None
 
 
-def _number(file: h5py.File, name: str) -> int | None:
-    """Return an attribute's integer, or None if it is missing or of another kind."""
+def _attribute(file: h5py.File, name: str, kinds: str) -> Any:
+    """Return an attribute that is a single value of some kinds; None if it is missing, another or too large."""
     if name not in file.attrs:
         return None
     known = file.attrs.get_id(name)
-    return int(np.asarray(file.attrs[name])) if known.dtype.kind in "iu" and known.shape == () else None
+    usable = known.dtype.kind in kinds and known.shape == () and known.dtype.itemsize <= MOST_JSON_BYTES
+    return file.attrs[name] if usable else None
 
 
 def find_dataset(file: h5py.File, name: str, *, path: str | Path) -> h5py.Dataset | None:
