@@ -333,7 +333,12 @@ def _serve(connection: Connection) -> None:
     frozen = False
     try:
         signal.signal(signal.SIGTERM, stop)
-        threading.Thread(target=_end_when_stopped, args=(_signals(),), daemon=True).start()
+        # The socket becomes readable at a signal, even while a library computes and no handler runs. No warning if it
+        # is full: one signal suffices.
+        reader, writer = socket.socketpair()
+        writer.setblocking(False)
+        signal.set_wakeup_fd(writer.detach(), warn_on_full_buffer=False)
+        threading.Thread(target=_end_when_stopped, args=(reader,), daemon=True).start()
         with preserve_interrupts():
             while (given := connection.recv()) is not None:
                 kind, content = given
@@ -355,15 +360,6 @@ def _serve(connection: Connection) -> None:
         # Whatever a library has made of the interrupt, there is nothing to report.
         if stopped.is_set():
             os._exit(1)
-
-
-def _signals() -> socket.socket:
-    """Return a socket that becomes readable at a signal, even while a library computes and no handler runs."""
-    reader, writer = socket.socketpair()
-    writer.setblocking(False)
-    # No warning if the socket is full: one signal suffices.
-    signal.set_wakeup_fd(writer.detach(), warn_on_full_buffer=False)
-    return reader
 
 
 def _end_when_stopped(signals: socket.socket) -> None:

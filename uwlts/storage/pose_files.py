@@ -26,7 +26,11 @@ FARTHEST_MM = 1e7
 _COMPASS = ("north", "east", "down")
 _ROUNDED = 2e-3
 """Deviation from a rigid matrix or a unit quaternion when numbers have three decimals."""
-_EULER = re.compile(r"euler-([xyz]{3}|[XYZ]{3})-(deg|rad)")
+_FORMAT = re.compile(
+    r"matrix|quaternion-(xyzw|wxyz)|(rotvec|angle)-(deg|rad)|euler-(?P<axes>[xyz]{3}|[XYZ]{3})-(deg|rad)"
+)
+_COLUMNS = {"matrix": (12, 16), "quaternion": (7,), "rotvec": (6,), "euler": (6,), "angle": (1,)}
+"""Numbers of columns of a pose, by the first word of the format."""
 _FORMATS = "matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-zyx-deg (fixed axes), euler-ZYX-deg"
 _FEWEST_POSES, _ALTERNATING, _RETURNED, _LEAST_JUMP_MM, _REACH_MM = 10, 0.2, 0.3, 0.1, 300.0
 """Two sources: least number of poses, share that jumps, largest distance after it relative to the jump, smallest jump,
@@ -275,19 +279,9 @@ def _order_names(names: list[str], pose_format: PoseFormat, path: Path) -> list[
 
 
 def poses_from_rows(rows: np.ndarray, pose_format: str, path: Path) -> np.ndarray:
-    euler = _EULER.fullmatch(pose_format)
-    counts = {
-        "matrix": (12, 16),
-        "quaternion-xyzw": (7,),
-        "quaternion-wxyz": (7,),
-        "rotvec-rad": (6,),
-        "rotvec-deg": (6,),
-        "angle-deg": (1,),
-        "angle-rad": (1,),
-    }
-    expected = (6,) if euler else counts.get(pose_format)
-    if expected is None:
+    if (known := _FORMAT.fullmatch(pose_format)) is None:
         raise DescriptionError(f"the format of the poses is {pose_format!r}; expected {_FORMATS}, or another order")
+    expected = _COLUMNS[pose_format.partition("-")[0]]
     if rows.shape[1] not in expected:
         raise DescriptionError(
             f"{path} has {rows.shape[1]} columns of numbers; a pose as {pose_format} has "
@@ -319,7 +313,8 @@ def poses_from_rows(rows: np.ndarray, pose_format: str, path: Path) -> np.ndarra
         if pose_format.endswith("-deg") and _NEAR_HALF_TURN < np.abs(turns).max(initial=0) < np.pi + 0.01:
             log_warnings(path, [f"angles are at most {np.abs(turns).max():.4g} deg: are they radians (-rad)?"])
         angles = np.radians(turns) if pose_format.endswith("-deg") else turns
-        rotations = Rotation.from_euler(euler[1], angles) if euler else Rotation.from_rotvec(angles)
+        axes = known["axes"]
+        rotations = Rotation.from_euler(axes, angles) if axes else Rotation.from_rotvec(angles)
     result[:, :3, :3] = rotations.as_matrix()
     return result
 
