@@ -168,12 +168,12 @@ class DerivedCommand:
 
     @cached_property
     def __signature__(self) -> inspect.Signature:
-        options = _options_of(self._package, self._function)
+        taken, options = self._taken, _options_of(self._package, self._function)
         if self._shortcuts is not None:
             for entry, hint in self._shortcuts.options.items():
                 name = f"{self._shortcuts.setting}_{entry}"
                 options[name] = inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=hint)
-        made = [*options.values(), *(one for name, one in self._own.items() if name not in self._taken)]
+        made = [*options.values(), *(one for name, one in self._own.items() if name not in taken)]
         for place, one in enumerate(made):
             if not self._is_common(one):
                 made[place] = one.replace(annotation=Annotated[one.annotation, Parameter(group=_ADVANCED)])
