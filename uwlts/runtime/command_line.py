@@ -265,10 +265,8 @@ def option_type(hint: Any) -> Any:
         if literals and get_origin(element) is Literal:
             element = Literal[(*(word for one in literals for word in get_args(one)), *get_args(element))]
         return tuple[element, ...]
-    if literals and not words:
-        return _or_none(reduce(or_, literals), kinds)
-    if words:
-        return _or_none(reduce(or_, words), kinds)
+    if plain := words or literals:
+        return _or_none(reduce(or_, plain), kinds)
     return tuple[str, ...] if any(get_origin(kind) is Mapping for kind in kinds) else None
 
 

@@ -59,7 +59,7 @@ _LEAN = (
     f"have no uncertainty. Use the cloud in HDF5 (NAME.h5) or in PLY with the whole uncertainty (NAME{FULL})"
 )
 _UNCERTAINTY = ["random_mm2", "position_mm", "patterns_mm", "poses_mm"]
-"""Arrays of `PointUncertainty` in HDF5, of which clouds may lack the last one."""
+"""Arrays of `PointUncertainty` in HDF5; the last one is optional."""
 _PAIR_NAMES = tuple("xyz"[i] + "xyz"[j] for i, j in PAIRS)
 _SHARED = "shared_errors"
 _COMMENT = "uwlts-metadata"
