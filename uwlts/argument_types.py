@@ -8,10 +8,9 @@ import inspect
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from functools import cache, wraps
-from itertools import repeat
 from numbers import Integral, Real
 from pathlib import Path
 from reprlib import Repr
@@ -36,8 +35,8 @@ _WRITTEN = OUTPUTS | {"path"}
 _inputs: ContextVar[tuple[str, ...]] = ContextVar("inputs", default=())
 
 
-class _MisfitError(Exception):
-    """A value does not have a type."""
+_MISFIT = object()
+"""Result of the conversion of a value that does not have a type."""
 
 
 @contextmanager
@@ -129,10 +128,10 @@ def _hints(function: Callable[..., Any]) -> dict[str, Any]:
 
 
 def _checked(name: str, value: Any, hint: Any) -> Any:
-    with suppress(_MisfitError):
-        return _convert(value, hint)
+    if (converted := _convert(value, hint)) is not _MISFIT:
+        return converted
     shown = _SHORT.repr(value)
-    single = any(_is_list(kind) and _fits([value], kind) for kind in union_members(hint))
+    single = any(_is_list(kind) and _convert([value], kind) is not _MISFIT for kind in union_members(hint))
     advice = f"; give a single one as [{shown}]" if single else ""
     raise ArgumentError(f"`{name}` is {shown} ({type(value).__name__}), expected {_describe(hint)}{advice}")
 
@@ -163,19 +162,9 @@ def _is_path(kind: Any) -> bool:
 
 
 def _convert(value: Any, hint: Any) -> Any:
-    """Return a value in one of the types of a union; raises _MisfitError if it has none of them."""
-    for kind in union_members(hint):
-        with suppress(_MisfitError):
-            return _convert_to_one(value, kind)
-    raise _MisfitError
-
-
-def _fits(value: Any, hint: Any) -> bool:
-    try:
-        _convert(value, hint)
-    except _MisfitError:
-        return False
-    return True
+    """Return a value in one of the types of a union, or `_MISFIT`."""
+    converted = (_convert_to_one(value, kind) for kind in union_members(hint))
+    return next((each for each in converted if each is not _MISFIT), _MISFIT)
 
 
 def _convert_to_one(value: Any, kind: Any) -> Any:
@@ -189,12 +178,10 @@ def _convert_to_one(value: Any, kind: Any) -> Any:
     elif _is_array(kind):
         return _convert_to_array(value)
     elif origin in (Mapping, dict):
-        fits = isinstance(value, Mapping) and all(map(_fits, value.values(), repeat(parts[1])))
+        fits = isinstance(value, Mapping) and all(_convert(each, parts[1]) is not _MISFIT for each in value.values())
     else:
         fits = _is_instance(value, origin)
-    if not fits:
-        raise _MisfitError
-    return value
+    return value if fits else _MISFIT
 
 
 def _is_instance(value: Any, kind: Any) -> bool:
@@ -211,14 +198,13 @@ def _is_instance(value: Any, kind: Any) -> bool:
 
 def _convert_entries(value: Any, origin: Any, parts: tuple[Any, ...]) -> Any:
     if isinstance(value, str | bytes) or not (isinstance(value, Sequence) or _is_array(type(value))):
-        raise _MisfitError
-    if origin is tuple and parts[-1] is not ...:
-        if len(value) != len(parts):
-            raise _MisfitError
-    else:
+        return _MISFIT
+    if origin is not tuple or parts[-1] is ...:
         parts = parts[:1] * len(value)
     entries = list(value)
     converted = list(map(_convert, entries, parts))
+    if len(entries) != len(parts) or any(each is _MISFIT for each in converted):
+        return _MISFIT
     if origin is tuple:
         return tuple(converted)
     return value if all(one is other for one, other in zip(entries, converted, strict=True)) else converted
@@ -229,14 +215,12 @@ def _convert_to_array(value: Any) -> Any:
     import numpy as np
 
     if isinstance(value, str | bytes | os.PathLike | Mapping | NoneType):
-        raise _MisfitError
+        return _MISFIT
     try:
         array = np.asarray(value)
     except (TypeError, ValueError):
-        raise _MisfitError from None
-    if not array.ndim or array.dtype.kind not in "biuf":
-        raise _MisfitError
-    return array
+        return _MISFIT
+    return array if array.ndim and array.dtype.kind in "biuf" else _MISFIT
 
 
 def _describe(hint: Any) -> str:

@@ -37,7 +37,7 @@ from uwlts.reconstruction.point_uncertainty import estimate_stripe_noise_px
 from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.storage.capture import Capture
 from uwlts.storage.image_file import read_image
-from uwlts.storage.import_ import import_images
+from uwlts.storage.import_.folder import import_images
 from uwlts.storage.pose_files import read_poses
 from uwlts.stripe import PeakRule, StripeOptions, extract_stripe, find_stripes
 from uwlts.targets import ChessboardTarget

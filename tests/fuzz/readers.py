@@ -53,7 +53,7 @@ from uwlts.storage.cloud_files import read_cloud, write_cloud
 from uwlts.storage.data_set import Sample, ShardReader, load_dataset, open_shard
 from uwlts.storage.figure_table import FigureTable, MeasuredFigure, read_figures
 from uwlts.storage.image_file import read_image
-from uwlts.storage.import_ import read_intrinsics, set_intrinsics
+from uwlts.storage.import_.camera_files import read_intrinsics, set_intrinsics
 from uwlts.storage.import_.centre_lines import read_profiles as read_centre_lines
 from uwlts.storage.import_.folder_description import capture_header, described_sensor, read_description, read_header
 from uwlts.storage.import_.matching import read_rows

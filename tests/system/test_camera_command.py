@@ -11,7 +11,7 @@ import yaml
 from tests.oracles import drawings
 from tests.system.in_process import uwlts
 from tests.system.test_imported_calibration import CENTRE, CHESSBOARD, SIZE, F, photographs, poses
-from uwlts.storage.import_ import read_intrinsics
+from uwlts.storage.import_.camera_files import read_intrinsics
 
 TARGET = 'kind = "chessboard"\ncolumns = 9\nrows = 6\nsquare_mm = 15.0\n'
 

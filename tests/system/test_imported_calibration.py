@@ -14,7 +14,7 @@ from uwlts.calibration.camera.camera_parameters import CameraOptions
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, calibrate_sequentially
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.storage.capture import Capture
-from uwlts.storage.import_ import import_images
+from uwlts.storage.import_.folder import import_images
 from uwlts.targets import CharucoTarget, ChessboardTarget
 
 SENSOR = coarse_sensor(window_mounted=False)

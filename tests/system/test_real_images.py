@@ -27,7 +27,7 @@ from uwlts.model.parameter_keys import LensParameter
 from uwlts.reconstruction.point_uncertainty import estimate_stripe_noise_px, measure_correlation
 from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.storage.capture import Capture
-from uwlts.storage.import_ import import_images
+from uwlts.storage.import_.folder import import_images
 from uwlts.storage.pose_files import read_poses
 from uwlts.stripe import PeakRule, StripeOptions, extract_stripe, find_stripes
 from uwlts.targets import ChessboardTarget

@@ -39,7 +39,7 @@ from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.calibration_file import load_calibration, resolve_calibration
 from uwlts.storage.capture import CAPTURES, CaptureHeader, Frame, part_path
 from uwlts.storage.cloud import PointCloud
-from uwlts.storage.point_cloud2 import (
+from uwlts.storage.ros_messages import (
     FRAME_ID,
     NANOSECONDS,
     MessageTypes,

@@ -6,14 +6,12 @@ result records that it was edited.
 
 import hashlib
 import json
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, JsonValue, ValidationError
 
-from uwlts.argument_types import check_arguments
 from uwlts.errors import CaptureError, Error, OutputError, describe_problems
 from uwlts.files.reading import MOST_JSON_BYTES, add_article, find_not_finite, log_warnings, parse_json, read_text
 from uwlts.files.writing import require_ending, write_atomically
@@ -90,17 +88,11 @@ def read_model(
         elif isinstance(provenance := content.get("provenance"), dict):
             content["provenance"] = provenance | {EDITED: True}
     content.pop(SEAL, None)
-    return validate_content(model, content, f"{path} is not a valid {called}", advice=advice)
-
-
-def validate_content(model: type[AnyModel], content: object, complaint: str, *, advice: str = "") -> AnyModel:
-    """Convert content to a model; raises CaptureError, which begins with ``complaint``, if it is not valid."""
     try:
         return model.model_validate(content)
-    except ValidationError as error:
-        raise CaptureError(f"{complaint}: {describe_problems(error)}{advice}") from error
-    except (Error, ArithmeticError) as error:
-        raise CaptureError(f"{complaint}: {error}{advice}") from error
+    except (ValidationError, Error, ArithmeticError) as error:
+        problem = describe_problems(error) if isinstance(error, ValidationError) else error
+        raise CaptureError(f"{path} is not a valid {called}: {problem}{advice}") from error
 
 
 def write_model(path: str | Path, model: BaseModel, *, file_format: str, version: int, overwrite: bool) -> None:
@@ -108,30 +100,15 @@ def write_model(path: str | Path, model: BaseModel, *, file_format: str, version
 
     Raises OutputError if the file exists and ``overwrite`` is not set, or cannot be written.
     """
-    require_ending(Path(path), (".json",))
     content = {"format": file_format, "version": version} | model.model_dump(mode="json")
-    with write_atomically(path, overwrite=overwrite) as aside:
-        aside.write_text(json_text(content, indent=2), encoding="utf-8")
+    write_record(path, content, overwrite=overwrite, indent=2)
 
 
-def write_record(path: str | Path, record: object, *, overwrite: bool) -> None:
+def write_record(path: str | Path, record: object, *, overwrite: bool, indent: int = 1) -> None:
     """Write the record of a result as indented JSON, completely or not at all; raises OutputError if that fails."""
     require_ending(Path(path), (".json",))
     with write_atomically(path, overwrite=overwrite) as aside:
-        aside.write_text(json_text(record, indent=1), encoding="utf-8")
-
-
-class RecordFile(ABC):
-    """Result whose record is written as JSON."""
-
-    @abstractmethod
-    def record(self) -> object:
-        """Return the result as JSON."""
-
-    @check_arguments
-    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Write the record as indented JSON, completely or not at all; raises OutputError if that fails."""
-        write_record(path, self.record(), overwrite=overwrite)
+        aside.write_text(json_text(record, indent=indent), encoding="utf-8")
 
 
 def describe_differences(there: object, now: object) -> str:
@@ -139,11 +116,9 @@ def describe_differences(there: object, now: object) -> str:
 
     ``there`` is the content of a file, ``now`` the wanted one.
     """
-    found = list(_different(there, now, ""))
+    found = [f"{entry} is {_brief(old)} in it, {_brief(new)} now" for entry, old, new in _different(there, now, "")]
     more = [f"and {len(found) - _SHOWN} more"] if len(found) > _SHOWN else []
-    return "; ".join(
-        [*(f"{entry} is {_brief(old)} in it, {_brief(new)} now" for entry, old, new in found[:_SHOWN])] + more
-    )
+    return "; ".join(found[:_SHOWN] + more)
 
 
 def describe_other_plan(there: dict[str, JsonValue], now: dict[str, JsonValue]) -> str:

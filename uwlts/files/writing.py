@@ -35,7 +35,7 @@ def write_atomically(path: str | os.PathLike[str], *, overwrite: bool = False) -
     """
     require_possible_name(Path(path))
     target = Path(os.path.realpath(path))
-    _require_suitable(target, overwrite=overwrite)
+    refuse_unsuitable(target, overwrite=overwrite)
     aside = target.parent / f".{secrets.token_hex(8)}{target.suffix}"
     _incomplete.add(aside)
     try:
@@ -43,7 +43,7 @@ def write_atomically(path: str | os.PathLike[str], *, overwrite: bool = False) -
         os.close(os.open(aside, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         yield aside
         _flush(aside, os.O_RDWR)
-        _require_suitable(target, overwrite=overwrite)
+        refuse_unsuitable(target, overwrite=overwrite)
         os.replace(aside, target)
         # Only POSIX systems can open a folder, to flush the renaming itself.
         if os.name == "posix":
@@ -66,7 +66,14 @@ def refuse_unsuitable(target: Path, *, overwrite: bool, endings: Sequence[str] =
 
     With ``endings``, the name must end with one of them.
     """
-    _require_suitable(target, overwrite=overwrite)
+    require_possible_name(target)
+    if not target.parent.is_dir():
+        raise OutputError(f"cannot write {target}: the folder {target.parent} does not exist; create it first")
+    if target.exists() and not target.is_file():
+        raise OutputError(f"cannot write {target}: it exists and is not a regular file; choose another name")
+    refuse_input(target)
+    if target.exists() and not overwrite:
+        raise OutputError(f"{target} exists already; give another name, or `overwrite` to replace it")
     require_ending(target, endings)
 
 
@@ -77,17 +84,6 @@ def require_ending(target: Path, endings: Sequence[str]) -> None:
             f"{target} ends with none of {', '.join(endings)}, which name the format of this file; give a name like "
             f"{target.stem}{endings[0]}"
         )
-
-
-def _require_suitable(target: Path, *, overwrite: bool) -> None:
-    require_possible_name(target)
-    if not target.parent.is_dir():
-        raise OutputError(f"cannot write {target}: the folder {target.parent} does not exist; create it first")
-    if target.exists() and not target.is_file():
-        raise OutputError(f"cannot write {target}: it exists and is not a regular file; choose another name")
-    refuse_input(target)
-    if target.exists() and not overwrite:
-        raise OutputError(f"{target} exists already; give another name, or `overwrite` to replace it")
 
 
 def require_possible_name(target: Path) -> None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from pathlib import Path
 
 import numpy as np
 
-from uwlts.files.json_files import RecordFile
+from uwlts.argument_types import check_arguments
+from uwlts.files.json_files import write_record
 from uwlts.model.sensor import Table
 from uwlts.model.short_text import Brief
 from uwlts.storage.cloud import PointCloud, rounding_std_mm
@@ -285,7 +287,7 @@ class Feature:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Inspection(Brief, RecordFile):
+class Inspection(Brief):
     """Result of an inspection.
 
     Attributes
@@ -324,6 +326,11 @@ class Inspection(Brief, RecordFile):
     def select(self, *kinds: FeatureKind) -> tuple[Feature, ...]:
         """Return the features of the given kinds."""
         return tuple(feature for feature in self.features if feature.kind in kinds)
+
+    @check_arguments
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the record as indented JSON, completely or not at all; raises OutputError if that fails."""
+        write_record(path, self.record(), overwrite=overwrite)
 
     def record(self) -> Table:
         """Return features and notes as JSON."""

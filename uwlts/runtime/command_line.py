@@ -69,11 +69,7 @@ class Shortcuts:
 
     setting: str
     options: Mapping[str, Any]
-    """Annotations of the options by the names of the entries."""
-
-    def names(self) -> list[str]:
-        """Return the names of the parameters, in the order of the entries."""
-        return [f"{self.setting}_{entry}" for entry in self.options]
+    """Annotations of the options by the names of the entries; the options' names are ``SETTING_ENTRY``."""
 
 
 def command_from(
@@ -97,7 +93,7 @@ def command_from(
     """
 
     def register(body: Callable[..., None]) -> DerivedCommand:
-        made = DerivedCommand(package, function, body, tuple(also), shortcuts, summary)
+        made = DerivedCommand(package, function, body, also, shortcuts, summary)
         name = body.__name__.strip("_").replace("_", "-")
         place = f"{body.__module__}:{body.__name__}"
         app.command(place, name=name, help=made.__doc__, help_format="markdown", group=JOBS[job])
@@ -133,7 +129,7 @@ class DerivedCommand:
         package: ModuleType,
         function: str,
         body: Callable[..., None],
-        also: tuple[tuple[ModuleType, str], ...],
+        also: Sequence[tuple[ModuleType, str]],
         shortcuts: Shortcuts | None,
         summary: str | None,
     ):
@@ -149,12 +145,8 @@ class DerivedCommand:
         return getattr(self._package, self._function)
 
     @property
-    def __signature__(self) -> inspect.Signature:
-        return self._made
-
-    @property
     def __annotations__(self) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return {name: one.annotation for name, one in self._made.parameters.items()}
+        return {name: one.annotation for name, one in self.__signature__.parameters.items()}
 
     @cached_property
     def _taken(self) -> dict[str, inspect.Parameter]:
@@ -175,17 +167,19 @@ class DerivedCommand:
         return own
 
     @cached_property
-    def _made(self) -> inspect.Signature:
+    def __signature__(self) -> inspect.Signature:
         taken, options = self._taken, _options_of(self._package, self._function)
         if self._shortcuts is not None:
-            entries = zip(self._shortcuts.names(), self._shortcuts.options.values(), strict=True)
-            options |= {
-                name: inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=hint)
-                for name, hint in entries
-            }
-        own = [one for name, one in self._own.items() if name not in taken]
-        made = [one if self._is_common(one) else _advanced(one) for one in [*options.values(), *own]]
-        return inspect.Signature(sorted(made, key=_place), return_annotation=None)
+            for entry, hint in self._shortcuts.options.items():
+                name = f"{self._shortcuts.setting}_{entry}"
+                options[name] = inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=hint)
+        made = [*options.values(), *(one for name, one in self._own.items() if name not in taken)]
+        for place, one in enumerate(made):
+            if not self._is_common(one):
+                made[place] = one.replace(annotation=Annotated[one.annotation, Parameter(group=_ADVANCED)])
+        # By kind, and parameters without a default first.
+        made.sort(key=lambda one: (one.kind, one.default is not one.empty))
+        return inspect.Signature(made, return_annotation=None)
 
     def _is_common(self, one: inspect.Parameter) -> bool:
         """Return whether an option is required, an output or its replacement, or part of the command's examples."""
@@ -197,11 +191,11 @@ class DerivedCommand:
 
     def __call__(self, *args: Any, **kwargs: Any) -> None:
         """Check the outputs, and run the body."""
-        bound = self._made.bind(*args, **kwargs)
+        bound = self.__signature__.bind(*args, **kwargs)
         bound.arguments.update({name: _plain_text(value) for name, value in bound.arguments.items()})
         explicit = dict(bound.arguments)
         bound.apply_defaults()
-        for name, one in self._made.parameters.items():
+        for name, one in self.__signature__.parameters.items():
             checks = [each for each in getattr(one.annotation, "__metadata__", ()) if isinstance(each, Before)]
             for before in checks if bound.arguments[name] is not None else ():
                 before.check(Path(bound.arguments[name]), overwrite=bound.arguments.get("overwrite", False))
@@ -209,10 +203,10 @@ class DerivedCommand:
         if any(one.kind is one.VAR_KEYWORD for one in self._taken.values()):
             given |= {name: value for name, value in explicit.items() if name in self._own}
         if self._shortcuts is not None:
-            names = zip(self._shortcuts.options, self._shortcuts.names(), strict=True)
-            entries = {entry: explicit[name] for entry, name in names if name in explicit}
-            if settings := parse_settings(self._shortcuts.setting, explicit.get(self._shortcuts.setting, ())) | entries:
-                given[self._shortcuts.setting] = settings
+            setting, entries = self._shortcuts.setting, self._shortcuts.options
+            settings = parse_settings(setting, explicit.get(setting, ()))
+            settings |= {each: explicit[name] for each in entries if (name := f"{setting}_{each}") in explicit}
+            given |= {setting: settings} if settings else {}
         for name, one in self._taken.items():
             if one.kind is one.VAR_POSITIONAL and name in given:
                 given["*"] = given.pop(name)
@@ -248,20 +242,11 @@ def _options_of(package: ModuleType, function: str) -> dict[str, inspect.Paramet
     return options
 
 
-def _advanced(one: inspect.Parameter) -> inspect.Parameter:
-    return one.replace(annotation=Annotated[one.annotation, Parameter(group=_ADVANCED)])
-
-
 def _plain_text(value: Any) -> Any:
     """Convert `PathText` to `str`, also in a tuple."""
     if isinstance(value, tuple):
         return tuple(map(_plain_text, value))
     return str(value) if isinstance(value, PathText) else value
-
-
-def _place(one: inspect.Parameter) -> tuple[int, bool]:
-    """Return a sort key for a signature: by kind, and parameters without a default first."""
-    return one.kind, one.default is not one.empty
 
 
 def option_type(hint: Any) -> Any:
@@ -280,10 +265,8 @@ def option_type(hint: Any) -> Any:
         if literals and get_origin(element) is Literal:
             element = Literal[(*(word for one in literals for word in get_args(one)), *get_args(element))]
         return tuple[element, ...]
-    if literals and not words:
-        return _or_none(reduce(or_, literals), kinds)
-    if words:
-        return _or_none(reduce(or_, words), kinds)
+    if plain := words or literals:
+        return _or_none(reduce(or_, plain), kinds)
     return tuple[str, ...] if any(get_origin(kind) is Mapping for kind in kinds) else None
 
 

@@ -17,7 +17,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait as wait_for_futures
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -154,7 +154,7 @@ def count_processors() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-class _Processes(Workers):
+class _Processes(Workers, AbstractContextManager["_Processes"]):
     """Processes on this machine, started with the first jobs.
 
     At its end the context stops them, by KeyboardInterrupt after an exception; after a time limit they are killed.
@@ -163,9 +163,6 @@ class _Processes(Workers):
     def __init__(self, count: int, *, threads: int):
         self.count, self._threads = count, threads
         self._processes: set[_Process] = set()
-
-    def __enter__(self) -> "_Processes":
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         for process in self._processes:
@@ -336,7 +333,12 @@ def _serve(connection: Connection) -> None:
     frozen = False
     try:
         signal.signal(signal.SIGTERM, stop)
-        threading.Thread(target=_end_when_stopped, args=(_signals(),), daemon=True).start()
+        # The socket becomes readable at a signal, even while a library computes and no handler runs. No warning if it
+        # is full: one signal suffices.
+        reader, writer = socket.socketpair()
+        writer.setblocking(False)
+        signal.set_wakeup_fd(writer.detach(), warn_on_full_buffer=False)
+        threading.Thread(target=_end_when_stopped, args=(reader,), daemon=True).start()
         with preserve_interrupts():
             while (given := connection.recv()) is not None:
                 kind, content = given
@@ -358,15 +360,6 @@ def _serve(connection: Connection) -> None:
         # Whatever a library has made of the interrupt, there is nothing to report.
         if stopped.is_set():
             os._exit(1)
-
-
-def _signals() -> socket.socket:
-    """Return a socket that becomes readable at a signal, even while a library computes and no handler runs."""
-    reader, writer = socket.socketpair()
-    writer.setblocking(False)
-    # No warning if the socket is full: one signal suffices.
-    signal.set_wakeup_fd(writer.detach(), warn_on_full_buffer=False)
-    return reader
 
 
 def _end_when_stopped(signals: socket.socket) -> None:

@@ -36,7 +36,6 @@ def resolve_calibration(calibration: AnyCalibration | str | Path) -> AnyCalibrat
 
 
 _VERIFICATION, _VERIFICATION_VERSION = "uwlts-verification", 1
-_ENDING = ".verification.json"
 _VALID = timedelta(days=1)
 """Validity of a verification, and of a new calibration: one day of use. Chosen by hand."""
 
@@ -54,7 +53,7 @@ class VerificationRecord(Description):
 
 def verification_path(calibration: str | Path) -> Path:
     """Return the path of the record beside a calibration's file: for water.json, water.verification.json."""
-    return Path(calibration).with_suffix(_ENDING)
+    return Path(calibration).with_suffix(".verification.json")
 
 
 def write_verification(calibration: str | Path, record: VerificationRecord) -> Path:

@@ -22,6 +22,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 import hdf5plugin  # noqa: F401, gives HDF5 the filter by which frames are read
@@ -37,9 +38,9 @@ from uwlts.model.sensor import Camera, CaptureHeader, Table
 from uwlts.model.stripe import ROWS, Stripe, StripeStatus
 from uwlts.storage.hdf5_file import (
     DAMAGE,
-    UnfinishedFile,
     find_dataset,
     has_writer,
+    open_unfinished,
     read_label,
     read_plan,
     read_values,
@@ -49,10 +50,13 @@ from uwlts.storage.hdf5_file import (
 FORMAT = "uwlts-capture"
 VERSION = 2
 """Version of captures with centre lines or a moving stage; captures of images at rest have version 1."""
-PER_FRAME = {"stage_mm": (), "pose": (4, 4), "laser_on": (), "exposure_ms": (), "time_s": ()}
-"""Columns of every capture, with the shape of one frame's value."""
+PER_FRAME: dict[str, tuple[tuple[int, ...], type]] = {"stage_mm": ((), float), "pose": ((4, 4), float)}
+PER_FRAME |= {"laser_on": ((), bool), "exposure_ms": ((), float), "time_s": ((), float)}
+"""Columns of every capture, with the shape and the type of one frame's value."""
 COVARIANCE = "pose_covariance"
-MORE = {"has_image": bool, "encoder": float, "speed_mm_per_s": float}
+MORE: dict[str, tuple[tuple[int, ...], type]] = {"has_image": ((), bool)} | dict.fromkeys(
+    ("encoder", "speed_mm_per_s"), ((), float)
+)
 """Columns of version 2."""
 POSE_ROUNDED = 1e-4
 """Largest deviation of a pose's elements from a rotation, for tables with four or more decimals."""
@@ -121,15 +125,11 @@ class FrameTable:
     @classmethod
     def from_frames(cls, header: CaptureHeader, frames: Sequence[Frame]) -> "FrameTable":
         """Return the table of frames in memory."""
-        none = np.full((4, 4), np.nan)
-        return cls(
-            header,
-            Path(header.name),
-            np.array([frame.stage_mm for frame in frames]),
-            np.array([frame.exposure_ms for frame in frames]),
-            np.array([none if frame.pose is None else frame.pose for frame in frames]).reshape(-1, 4, 4),
-            np.array([frame.speed_mm_per_s for frame in frames]),
+        stage, exposure, speed = (
+            np.array([(f.stage_mm, f.exposure_ms, f.speed_mm_per_s) for f in frames]).reshape(-1, 3).T
         )
+        poses = [np.full((4, 4), np.nan) if frame.pose is None else frame.pose for frame in frames]
+        return cls(header, Path(header.name), stage, exposure, np.array(poses).reshape(-1, 4, 4), speed)
 
 
 def sensor_poses(capture: "Capture | FrameTable") -> np.ndarray:
@@ -148,13 +148,6 @@ NO_STAGE = "none: stage_mm counts the poses"
 def part_path(path: Path) -> Path:
     """Return the name of an unfinished recording of ``path``."""
     return path.with_name(path.name + ".part")
-
-
-def _dataset(file: h5py.File, name: str, path: Path) -> h5py.Dataset:
-    dataset = find_dataset(file, name, path=path)
-    if dataset is None or dataset.ndim == 0:
-        raise CaptureError(f"{path} is damaged: it has no '{name}' for every frame")
-    return dataset
 
 
 def require_covariances(values: np.ndarray, path: Path) -> None:
@@ -191,9 +184,9 @@ class Capture(AbstractContextManager["Capture"]):
         Whether the laser was on, rather than the lamp.
     pose : (N, 4, 4) float64
         ``T_scene_object`` of the sensor's OCS, a rotation with a shift; all NaN for a frame without one. It is that of
-            the platform, ``T_scene_platform``, if the header states ``T_platform_sensor``.
-        pose_covariance : (N, 6, 6) float64 or None
-            Covariance of each pose (`Frame`), all NaN if unknown; None in captures without any.
+        the platform, ``T_scene_platform``, if the header states ``T_platform_sensor``.
+    pose_covariance : (N, 6, 6) float64 or None
+        Covariance of each pose (`Frame`), all NaN if unknown; None in captures without any.
     has_image : (N,) bool
         Whether a frame is an image, rather than a centre line.
     encoder : (N,) float64
@@ -215,7 +208,7 @@ class Capture(AbstractContextManager["Capture"]):
         require_regular_file(self.path, called="capture")
         try:
             unfinished = not self.finished or has_writer(self.path)
-            self.file = UnfinishedFile(self.path) if unfinished else h5py.File(self.path, "r")
+            self.file = open_unfinished(self.path) if unfinished else h5py.File(self.path, "r")
         except DAMAGE as error:
             raise CaptureError(f"{self.path} is not a capture, or is truncated: {_what_is_wrong(error)}") from error
         try:
@@ -233,38 +226,35 @@ class Capture(AbstractContextManager["Capture"]):
         images = self._dataset("frames", (camera.height_px, camera.width_px), "u")
         if images.chunks != (1, *images.shape[1:]) or images.dtype.itemsize > 2:
             raise CaptureError(f"{self.path} is damaged: frames are {images.dtype} in chunks of {images.chunks}")
-        columns = {
-            name: self._column(name, shape, "b" if name == "laser_on" else "f") for name, shape in PER_FRAME.items()
-        }
+        held = PER_FRAME | {name: each for name, each in MORE.items() if name in self.file}
+        columns = {name: self._column(name, shape, np.dtype(kind).kind) for name, (shape, kind) in held.items()}
         self._images, self.dtype = images, images.dtype.newbyteorder("=")
         self.holds_lines = "centre_lines" in self.file
         self.moving = "stage_reports" in self.file
-        more = {
-            name: self._column(name, (), "b" if kind is bool else "f")
-            for name, kind in MORE.items()
-            if name in self.file
-        }
-        counted = [images, *columns.values(), *more.values()]
+        self._count = min(map(len, (images, *columns.values())))
         if self.holds_lines:
             self._lines = self._dataset("centre_lines", (len(ROWS), camera.lines()), "f")
             if self._lines.chunks != (1, *self._lines.shape[1:]):
                 raise CaptureError(f"{self.path} is damaged: centre lines are in chunks of {self._lines.chunks}")
-            counted.append(self._lines)
-        self._count = min(map(len, counted))
-        known = {name: read_values(dataset, slice(self._count)) for name, dataset in more.items()}
-        self.has_image = known.get("has_image", np.ones(self._count, bool))
-        self.encoder = known.get("encoder", np.full(self._count, np.nan))
-        self.speed_mm_per_s = known.get("speed_mm_per_s", np.zeros(self._count))
-        self.stage_reports = np.empty((0, 2))
-        if self.moving:
-            self.stage_reports = read_values(self._column("stage_reports", (2,), "f"))
+            self._count = min(self._count, len(self._lines))
+        self.has_image, self.encoder, self.speed_mm_per_s = (
+            read_values(columns[name], slice(self._count)) if name in columns else np.full(self._count, usual)
+            for name, usual in zip(MORE, (True, np.nan, 0.0), strict=True)
+        )
+        reports = self._column("stage_reports", (2,), "f") if self.moving else None
+        self.stage_reports = np.empty((0, 2)) if reports is None else read_values(reports)
         if self.holds_lines:
             self._require_stored(self._lines, int(np.count_nonzero(~self.has_image)), "centre lines")
         self._require_stored(images, int(np.count_nonzero(self.has_image)), "images")
         self.stage_mm, self.pose, self.laser_on, self.exposure_ms, self.time_s = (
-            read_values(dataset, slice(self._count)) for dataset in columns.values()
+            read_values(columns[name], slice(self._count)) for name in PER_FRAME
         )
-        self._require_plausible()
+        if not (np.isfinite(self.speed_mm_per_s).all() and np.isfinite(self.stage_reports).all()):
+            raise CaptureError(f"{self.path} holds speeds or reports of the stage that are not finite")
+        if not all(np.isfinite(values).all() for values in (self.stage_mm, self.exposure_ms, self.time_s)):
+            raise CaptureError(f"{self.path} holds stage positions, exposures or times that are not finite")
+        if (self.exposure_ms < 0).any():
+            raise CaptureError(f"{self.path} holds negative exposures")
         self.pose_covariance = self._checked_poses()
         if unfinished and self._count > 1 and self.time_s[-1] < self.time_s[-2]:
             # The writer was killed between extending the datasets and storing its last frame.
@@ -273,15 +263,6 @@ class Capture(AbstractContextManager["Capture"]):
                 setattr(self, name, getattr(self, name)[: self._count])
         if (np.diff(self.time_s) < 0).any():
             raise CaptureError(f"{self.path} holds times that decrease")
-
-    def _require_plausible(self) -> None:
-        """Raise CaptureError for numbers that are not finite, and negative exposures."""
-        if not (np.isfinite(self.speed_mm_per_s).all() and np.isfinite(self.stage_reports).all()):
-            raise CaptureError(f"{self.path} holds speeds or reports of the stage that are not finite")
-        if not all(np.isfinite(values).all() for values in (self.stage_mm, self.exposure_ms, self.time_s)):
-            raise CaptureError(f"{self.path} holds stage positions, exposures or times that are not finite")
-        if (self.exposure_ms < 0).any():
-            raise CaptureError(f"{self.path} holds negative exposures")
 
     def _checked_poses(self) -> np.ndarray | None:
         """Check the poses, and return their covariances if the file has them."""
@@ -305,7 +286,9 @@ class Capture(AbstractContextManager["Capture"]):
 
     def _dataset(self, name: str, shape: tuple[int, ...], kind: str) -> h5py.Dataset:
         """Return a dataset with one row of this shape per frame; raises CaptureError for any other dataset."""
-        dataset = _dataset(self.file, name, self.path)
+        dataset = find_dataset(self.file, name, path=self.path)
+        if dataset is None or dataset.ndim == 0:
+            raise CaptureError(f"{self.path} is damaged: it has no '{name}' for every frame")
         if dataset.shape[1:] != shape or dataset.dtype.kind != kind:
             raise CaptureError(
                 f"{self.path} contradicts itself: '{name}' is {dataset.dtype} of {dataset.shape[1:]} per frame, "
@@ -366,15 +349,14 @@ class Capture(AbstractContextManager["Capture"]):
 
     def __getitem__(self, index: int) -> Frame:
         """Return a frame with its metadata; raises CaptureError if its data are damaged."""
+        known: dict[str, Any]
         index = index + self._count if index < 0 else index
         seen = self.read_observation(index)
         columns = (self.stage_mm, self.laser_on, self.exposure_ms, self.time_s)
-        pose = self.pose[index] if np.isfinite(self.pose[index]).all() else None
-        own = None if self.pose_covariance is None else self.pose_covariance[index]
-        covariance = own if own is not None and np.isfinite(own).all() else None
-        encoder = self.encoder[index].item() if np.isfinite(self.encoder[index]) else None
-        known = {"pose": pose, "encoder": encoder, "speed_mm_per_s": self.speed_mm_per_s[index].item()}
-        known["pose_covariance"] = covariance
+        known = {"speed_mm_per_s": self.speed_mm_per_s[index].item()}
+        known["encoder"] = self.encoder[index].item() if np.isfinite(self.encoder[index]) else None
+        for name, values in (("pose", self.pose), (COVARIANCE, self.pose_covariance)):
+            known[name] = values[index] if values is not None and np.isfinite(values[index]).all() else None
         return Frame(seen, *(column[index].item() for column in columns), **known)
 
     def frames(self, *, laser_on: bool | None = None) -> Iterator[tuple[int, np.ndarray]]:

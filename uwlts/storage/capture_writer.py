@@ -86,12 +86,15 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         resume: bool = False,
     ):
         self.path, self.header, self._plan = Path(path), header, plan
-        self._per_frame = PER_FRAME | ({COVARIANCE: (6, 6)} if covariances else {})
         self._last_s = -math.inf
         self._part = part_path(self.path)
         camera = header.sensor.camera
         self._shape, self._dtype = (camera.height_px, camera.width_px), np.dtype(dtype)
         self._lines, self._moving = camera.lines() if centre_lines else 0, moving
+        self._columns: dict[str, tuple[tuple[int, ...], type]] = {COVARIANCE: ((6, 6), float)} if covariances else {}
+        self._columns |= MORE if self._version() > 1 else {}
+        # The time is written last: its length is the number of frames.
+        self._columns |= PER_FRAME
         if self._dtype not in (np.uint8, np.uint16):
             raise ImageError(f"a capture holds images of uint8 or uint16, not of {self._dtype}")
         with self._storage():
@@ -155,11 +158,10 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
                         fletcher32=True,
                         **hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE),
                     )
-                columns = self._per_frame | (dict.fromkeys(MORE, ()) if self._version() > 1 else {})
                 if self._moving:
                     self._file.create_dataset("stage_reports", (0, 2), float, maxshape=(None, 2), chunks=(256, 2))
-                for name, shape in columns.items():
-                    kind, chunks = MORE.get(name, bool if name == "laser_on" else float), (256, *shape)
+                for name, (shape, kind) in self._columns.items():
+                    chunks = 256, *shape
                     # No checksum: if a kill interrupts the rewriting of a chunk, it would lose 256 rows instead of the
                     # last one.
                     self._file.create_dataset(name, (0, *shape), kind, maxshape=(None, *shape), chunks=chunks)
@@ -192,7 +194,15 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         OutputError
             Writing fails; earlier frames are kept.
         """
-        self._require_fitting(frame)
+        seen = frame.seen
+        if isinstance(seen, Stripe):
+            if len(seen.centre_px) != self._lines:
+                held = f"centre lines of {self._lines} profile lines" if self._lines else "images"
+                raise ImageError(f"frame is a centre line of {len(seen.centre_px)} lines, the capture holds {held}")
+        elif seen.shape != self._shape or seen.dtype != self._dtype:
+            raise ImageError(f"frame is {seen.shape} {seen.dtype}, the capture holds {self._shape} {self._dtype}")
+        elif self._lines and frame.laser_on:
+            raise ImageError("frame is an image with the laser on, the capture holds centre lines for these")
         if frame.speed_mm_per_s and not self._moving:
             raise CaptureError(f"a frame moves by {frame.speed_mm_per_s:g} mm/s in a capture of a stage at rest")
         if not np.isfinite([frame.stage_mm, frame.exposure_ms, frame.time_s]).all() or frame.exposure_ms < 0:
@@ -209,7 +219,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         if frame.pose is not None and not is_rigid(frame.pose, within=POSE_ROUNDED):
             raise CaptureError(f"a pose must be a rotation, a shift and 0 0 0 1; found {frame.pose.tolist()}")
         if frame.pose_covariance is not None:
-            if COVARIANCE not in self._per_frame:
+            if COVARIANCE not in self._columns:
                 raise CaptureError("the capture was begun without covariances of poses: begin it with covariances=True")
             require_covariances(np.asarray(frame.pose_covariance)[None], self.path)
         with self._storage():
@@ -228,45 +238,24 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
                 dataset[...] = values
                 dataset.flush()
 
-    def _require_fitting(self, frame: Frame) -> None:
-        seen = frame.seen
-        if isinstance(seen, Stripe):
-            if len(seen.centre_px) != self._lines:
-                held = f"centre lines of {self._lines} profile lines" if self._lines else "images"
-                raise ImageError(f"frame is a centre line of {len(seen.centre_px)} lines, the capture holds {held}")
-        elif seen.shape != self._shape or seen.dtype != self._dtype:
-            raise ImageError(f"frame is {seen.shape} {seen.dtype}, the capture holds {self._shape} {self._dtype}")
-        elif self._lines and frame.laser_on:
-            raise ImageError("frame is an image with the laser on, the capture holds centre lines for these")
-
     def _store(self, frame: Frame) -> None:
         self._claim_space()
-        pose = np.full((4, 4), np.nan) if frame.pose is None else frame.pose
-        values: dict[str, object] = {"stage_mm": frame.stage_mm, "pose": pose, "laser_on": frame.laser_on}
-        if self._version() > 1:
-            encoder = np.nan if frame.encoder is None else frame.encoder
-            values |= {"has_image": not isinstance(frame.seen, Stripe), "encoder": encoder}
-            values |= {"speed_mm_per_s": frame.speed_mm_per_s}
-        if isinstance(frame.seen, Stripe):
-            kept, seen = "centre_lines", stack_rows(frame.seen)
-        else:
-            kept, seen = "frames", frame.seen
-        if COVARIANCE in self._per_frame:
-            values[COVARIANCE] = np.full((6, 6), np.nan) if frame.pose_covariance is None else frame.pose_covariance
-        # The time is written last: its length is the number of frames.
-        values |= {"exposure_ms": frame.exposure_ms, "time_s": frame.time_s}
-        count = len(self)
+        line = stack_rows(frame.seen) if isinstance(frame.seen, Stripe) else None
         # Chunks of a dataset that are not written take no space.
-        for name in ("frames", "centre_lines") if self._lines else ("frames",):
-            dataset = self._arrays[name]
-            dataset.resize(count + 1, axis=0)
-            if name == kept:
-                dataset[count] = seen
-            dataset.flush()
+        values: dict[str, object] = {"frames": frame.seen if line is None else None} | (
+            {"centre_lines": line} if self._lines else {}
+        )
+        known = vars(frame) | {"has_image": line is None}
+        values |= {
+            name: np.full(shape, np.nan) if known[name] is None else known[name]
+            for name, (shape, _) in self._columns.items()
+        }
+        count = len(self)
         for name, value in values.items():
             dataset = self._arrays[name]
             dataset.resize(count + 1, axis=0)
-            dataset[count] = value
+            if value is not None:
+                dataset[count] = value
             dataset.flush()
         self._last_s = frame.time_s
 

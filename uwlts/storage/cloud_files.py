@@ -5,7 +5,6 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -21,21 +20,21 @@ from uwlts.storage.cloud import (
     FARTHEST_SINGLE_MM,
     KINDS,
     NO_INDEX,
-    OPTIONAL,
     PAIRS,
     PER_POINT,
     STEP,
     PointCloud,
     PointUncertainty,
+    compute_normal_std,
     concatenate_clouds,
     find_float_step,
     metadata_json,
     note_step,
     omit_points,
 )
-from uwlts.storage.foreign_clouds import FORMATS, find_format, read_foreign, require_libraries, write_foreign
-from uwlts.storage.hdf5_file import DAMAGE, find_dataset, read_array, read_format, read_label, write_label
-from uwlts.storage.normal_std import compute_normal_std
+from uwlts.storage.foreign_clouds import FORMATS, find_format
+from uwlts.storage.hdf5_file import DAMAGE, find_dataset, read_array, read_format, read_label, write_arrays
+from uwlts.storage.las_file import load_library
 from uwlts.storage.number_tables import Unit, choose_scale, find_stated_unit
 from uwlts.storage.ply import encode_ply, read_comments, read_ply
 from uwlts.storage.repeated_points import omit_repeated
@@ -60,6 +59,7 @@ _LEAN = (
     f"have no uncertainty. Use the cloud in HDF5 (NAME.h5) or in PLY with the whole uncertainty (NAME{FULL})"
 )
 _UNCERTAINTY = ["random_mm2", "position_mm", "patterns_mm", "poses_mm"]
+"""Arrays of `PointUncertainty` in HDF5; the last one is optional."""
 _PAIR_NAMES = tuple("xyz"[i] + "xyz"[j] for i, j in PAIRS)
 _SHARED = "shared_errors"
 _COMMENT = "uwlts-metadata"
@@ -89,11 +89,18 @@ def write_cloud(
     """
     path = Path(path)
     require_ending(path, CLOUD_FORMATS if colours is None else COLOURED_FORMATS)
-    if find_format(path) is not None:
-        write_foreign(path, cloud, overwrite=overwrite, colours=colours)
+    if (form := find_format(path)) is not None and form.write is not None:
+        if len(cloud) == 0:
+            raise OutputError(f"the cloud has no points, and {path.suffix} cannot hold none: write PLY or HDF5")
+        with write_atomically(path, overwrite=overwrite) as aside:
+            form.write(aside, cloud, colours, path)
         return
     if _in_hdf5(path):
-        _write_hdf5(path, cloud, overwrite=overwrite)
+        arrays, known = {name: getattr(cloud, name) for name in KINDS}, cloud.uncertainty
+        if known is not None:
+            arrays |= {name: getattr(known, name) for name in _UNCERTAINTY} | {"systematic_mm2": known.systematic_mm2()}
+        header = _CloudHeader(metadata=_with_shared(cloud))
+        write_arrays(path, arrays, file_format=FORMAT, version=VERSION, header=header, overwrite=overwrite)
         return
     single = str(path).lower().endswith(SINGLE)
     if single and np.abs(cloud.points_mm).max(initial=0.0) > FARTHEST_SINGLE_MM:
@@ -132,7 +139,9 @@ def refuse_unsuitable_cloud(path: str | os.PathLike[str], *, overwrite: bool, co
     path = Path(path)
     refuse_unsuitable(path, overwrite=overwrite)
     require_ending(path, COLOURED_FORMATS if coloured else CLOUD_FORMATS)
-    require_libraries(path)
+    form = find_format(path)
+    for name in () if form is None else form.libraries:
+        load_library(name, path.suffix.strip(".").upper())
 
 
 def read_cloud(path: str | os.PathLike[str], *, unit: Unit | None = None) -> PointCloud:
@@ -174,8 +183,8 @@ def read_thinned_cloud(
     For HDF5 and binary PLY only these are held in memory.
     """
     with _naming(path):
-        if find_format(path) is not None:
-            whole = read_foreign(Path(path), unit=unit)
+        if (form := find_format(path)) is not None:
+            whole = form.read(Path(path), unit)
             cloud, total = whole.select(_every(len(whole), at_most)), len(whole)
         else:
             cloud, total = _read_rows(Path(path), lambda count: _every(count, at_most))
@@ -309,27 +318,19 @@ def _in_hdf5(path: str | os.PathLike[str]) -> bool:
     return Path(path).suffix.lower() == ".h5"
 
 
-def _move_names(patterns: int) -> list[str]:
-    return [f"{move}_{axis}" for move in ("position", *(f"pattern{m}" for m in range(patterns))) for axis in "xyz"]
-
-
 def _uncertainty_columns(uncertainty: PointUncertainty | None) -> dict[str, np.ndarray]:
     """Return columns (N,) float32 by the names of their vertex properties."""
     if uncertainty is None:
         return {}
-    names = [f"{kind}_{pair}" for kind in ("random", "systematic") for pair in _PAIR_NAMES]
-    names += _move_names(len(uncertainty.patterns_mm))
-    patterns = np.moveaxis(uncertainty.patterns_mm, 2, 1).reshape(-1, len(uncertainty.random_mm2))
-    parts = uncertainty.random_mm2.T, uncertainty.systematic_mm2().T, uncertainty.position_mm.T, patterns
-    columns = dict(zip(names, np.vstack(parts).astype(np.float32), strict=True))
-    if uncertainty.poses_mm is not None:
-        poses = np.moveaxis(uncertainty.poses_mm, 2, 1).reshape(-1, len(uncertainty.random_mm2))
-        columns |= dict(zip(_pose_names(len(uncertainty.poses_mm)), poses.astype(np.float32), strict=True))
-    return columns
-
-
-def _pose_names(count: int) -> list[str]:
-    return [f"pose{k}_{axis}" for k in range(count) for axis in "xyz"]
+    parts = {"random": uncertainty.random_mm2, "systematic": uncertainty.systematic_mm2()}
+    columns = {
+        f"{part}_{pair}": each for part, each in parts.items() for pair, each in zip(_PAIR_NAMES, each.T, strict=True)
+    }
+    moves = {"position": uncertainty.position_mm}
+    for part, several in (("pattern", uncertainty.patterns_mm), ("pose", uncertainty.poses_mm)):
+        moves |= {f"{part}{k}": move for k, move in enumerate(() if several is None else several)}
+    columns |= {f"{name}_{axis}": move[:, k] for name, move in moves.items() for k, axis in enumerate("xyz")}
+    return {name: values.astype(np.float32) for name, values in columns.items()}
 
 
 def _with_shared(cloud: PointCloud) -> Table:
@@ -384,23 +385,18 @@ def _metadata(comments: list[str]) -> Table:
 def _read_uncertainty(names: Mapping[str, str], column: Callable[[str], np.ndarray]) -> PointUncertainty | None:
     """Return the uncertainty in columns ``names``; None without all of them."""
     count, parts = (sum(f"{part}{k}_x" in names for k in range(len(names))) for part in ("pattern", "pose"))
-    wanted = [f"random_{pair}" for pair in _PAIR_NAMES] + _move_names(count)
-    if not count or not all(name in names for name in wanted):
+    wanted = [[f"random_{pair}" for pair in _PAIR_NAMES]]
+    wanted += [[f"{move}_{axis}" for axis in "xyz"] for move in ("position", *(f"pattern{k}" for k in range(count)))]
+    if not count or not all(name in names for each in wanted for name in each):
         return None
-    columns = np.stack([column(name) for name in wanted])
-    random, position = columns[:6].T.copy(), columns[6:9].T.copy()
-
-    def vectors(rows: np.ndarray) -> np.ndarray:
-        return np.ascontiguousarray(np.moveaxis(rows.reshape(len(rows) // 3, 3, -1), 1, 2))
-
-    poses = None
-    if parts and all(name in names for name in _pose_names(parts)):
-        poses = vectors(np.stack([column(name) for name in _pose_names(parts)]))
-    return PointUncertainty(random, position, vectors(columns[9:]), poses_mm=poses)
+    random, position, *patterns = (np.column_stack([column(name) for name in each]) for each in wanted)
+    turned = [[f"pose{k}_{axis}" for axis in "xyz"] for k in range(parts)]
+    known = parts and all(name in names for each in turned for name in each)
+    poses = np.stack([np.column_stack([column(name) for name in each]) for each in turned]) if known else None
+    return PointUncertainty(random, position, np.stack(patterns), poses_mm=poses)
 
 
-def _read_vertices(path: Path) -> tuple[np.ndarray, list[str]]:
-    """Return the vertices of a PLY file as a structured array, and the comments."""
+def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     try:
         whole, comments = read_ply(path, "vertex", called="cloud")
     except OSError as error:
@@ -409,11 +405,6 @@ def _read_vertices(path: Path) -> tuple[np.ndarray, list[str]]:
         raise CaptureError(f"{path} does not fit into the memory") from error
     if whole is None:
         raise CaptureError(f"{path} is a PLY file without vertices; expected an element 'vertex'")
-    return whole, comments
-
-
-def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
-    whole, comments = _read_vertices(path)
     vertices, names = whole[rows(len(whole))], whole.dtype.names or ()
     known = {name.lower().removeprefix("scalar_"): name for name in names} | {name: name for name in names}
     if missing := [axis for axis in "xyz" if axis not in known]:
@@ -466,52 +457,30 @@ class _CloudHeader(Description):
     metadata: Table
 
 
-def _write_hdf5(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: bool) -> None:
-    arrays = {name: getattr(cloud, name) for name in PER_POINT}
-    arrays |= {name: each for name in OPTIONAL if (each := getattr(cloud, name)) is not None}
-    if cloud.uncertainty is not None:
-        arrays |= {name: each for name in _UNCERTAINTY if (each := getattr(cloud.uncertainty, name)) is not None}
-        arrays["systematic_mm2"] = cloud.uncertainty.systematic_mm2()
-    # Written in memory first: HDF5 does not survive a full disk.
-    content = BytesIO()
-    with h5py.File(content, "w", libver="latest") as file:
-        write_label(file, file_format=FORMAT, version=VERSION, header=_CloudHeader(metadata=_with_shared(cloud)))
-        for name, data in arrays.items():
-            file.create_dataset(name, data=data, compression="gzip", compression_opts=1, shuffle=True, fletcher32=True)
-    with write_atomically(path, overwrite=overwrite) as aside:
-        aside.write_bytes(content.getbuffer())
-
-
 def _read_hdf5(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     require_regular_file(path, called="cloud")
-    names = _UNCERTAINTY
     try:
         with h5py.File(path, "r") as file:
             header = read_label(file, _CloudHeader, path=path, file_format=FORMAT, version=VERSION)
             points = find_dataset(file, "points_mm", path=path)
             total = 0 if points is None or not points.ndim else len(points)
             chosen = rows(total)
-            selection: dict[str, tuple[slice, ...]] = dict.fromkeys((*KINDS, *names), (chosen,))
-            selection["patterns_mm"] = selection["poses_mm"] = (slice(None), chosen)
-            found = {name: read_array(file, name, path=path, selection=selection[name]) for name in selection}
+            selection = dict.fromkeys((*KINDS, *_UNCERTAINTY), (chosen,))
+            selection |= dict.fromkeys(("patterns_mm", "poses_mm"), (slice(None), chosen))
+            found = {name: read_array(file, name, path=path, selection=each) for name, each in selection.items()}
     except DAMAGE as error:
         raise CaptureError(f"{path} is not a complete HDF5 file of a cloud: {error}") from error
-    arrays = {name: values for name, values in found.items() if values is not None}
+    arrays: dict[str, Any] = {name: values for name, values in found.items() if values is not None}
     # Conversion must not truncate integers, nor round fractions.
     wanted_kinds = {name: np.dtype(KINDS.get(name, np.float32)).kind for name in arrays}
     if unusable := [name for name, values in arrays.items() if values.dtype.kind != wanted_kinds[name]]:
         raise CaptureError(f"{path} is damaged: {', '.join(unusable)} are no numbers of the expected kind")
-    if unusable := [
-        n for n in ("frame", "line") if n in arrays and (np.abs(arrays[n].astype(np.float64)) >= 2**31).any()
-    ]:
+    integers = [name for name in ("frame", "line") if name in arrays]
+    if unusable := [name for name in integers if (np.abs(arrays[name].astype(np.float64)) >= 2**31).any()]:
         raise CaptureError(f"{path} is damaged: {', '.join(unusable)} has values of more than 32 bits")
-    needed = [name for name in names if name != "poses_mm"]
-    wanted = [*PER_POINT, *(needed if any(name in arrays for name in names) else ())]
-    if missing := [name for name in wanted if name not in arrays]:
+    parts = {name: arrays.pop(name) for name in _UNCERTAINTY if name in arrays}
+    wanted = [*PER_POINT, *(_UNCERTAINTY[:-1] if parts else ())]
+    if missing := [name for name in wanted if name not in arrays | parts]:
         raise CaptureError(f"{path} is damaged: it has no {', '.join(missing)}")
-    known = None
-    if needed[0] in arrays:
-        known = PointUncertainty(*(arrays[name] for name in needed), poses_mm=arrays.get("poses_mm"))
-    per_point: dict[str, Any] = {name: arrays[name] for name in KINDS if name in arrays}
-    metadata, known = _without_shared(header.metadata, known)
-    return PointCloud(**per_point, uncertainty=known, metadata=metadata), total
+    metadata, known = _without_shared(header.metadata, PointUncertainty(**parts) if parts else None)
+    return PointCloud(**arrays, uncertainty=known, metadata=metadata), total

@@ -66,12 +66,13 @@ class ShardWriter:
 
     def add(self, sample: Sample) -> None:
         """Write a sample."""
-        self._write_member(f"{sample.key}.png", _png(sample.image, _NOISY))
+        self._write_member(f"{sample.key}.png", cv2.imencode(".png", sample.image, _NOISY)[1].tobytes())
         for name, values in sample.arrays.items():
             if name in _PICTURES:
-                self._write_member(f"{sample.key}.{name}.png", _png(values, _UNIFORM))
+                self._write_member(f"{sample.key}.{name}.png", cv2.imencode(".png", values, _UNIFORM)[1].tobytes())
             else:
-                self._write_member(f"{sample.key}.{name}.npy", _npy(values))
+                np.save(content := io.BytesIO(), values, allow_pickle=False)
+                self._write_member(f"{sample.key}.{name}.npy", content.getvalue())
         self._write_member(f"{sample.key}.json", json.dumps(sample.info, allow_nan=False).encode())
 
     def _write_member(self, name: str, content: bytes) -> None:
@@ -79,16 +80,6 @@ class ShardWriter:
         member = tarfile.TarInfo(name)
         member.size = len(content)
         self._archive.addfile(member, io.BytesIO(content))
-
-
-def _png(values: np.ndarray, settings: list[int]) -> bytes:
-    return cv2.imencode(".png", values, settings)[1].tobytes()
-
-
-def _npy(values: np.ndarray) -> bytes:
-    content = io.BytesIO()
-    np.save(content, values, allow_pickle=False)
-    return content.getvalue()
 
 
 class ShardReader:
@@ -105,21 +96,18 @@ class ShardReader:
         """Read a sample: arrays by name, with "key", "image" and "info", its metadata; only ``names`` if given."""
         require_regular_file(self.path, called="shard of a data set")
         try:
-            return self._read_sample(number, names)
+            if self._places is None:
+                self._places = self._found_places()
+            key, places = self._places[number]
+            sample: dict[str, Any] = {"key": key}
+            with open(self.path, "rb") as file:
+                for ending, (offset, size) in places.items():
+                    name = {"png": "image", "json": "info"}.get(ending, ending.partition(".")[0])
+                    if names is None or name in names:
+                        file.seek(offset)
+                        sample[name] = _decode(ending, file.read(size))
         except (*NPY_DAMAGE, LookupError, TypeError, AttributeError, tarfile.TarError, cv2.error) as error:
             raise CaptureError(f"{self.path} is not a shard of this data set, or is damaged: {error}") from error
-
-    def _read_sample(self, number: int, names: tuple[str, ...] | None) -> dict[str, Any]:
-        if self._places is None:
-            self._places = self._found_places()
-        key, places = self._places[number]
-        sample: dict[str, Any] = {"key": key}
-        with open(self.path, "rb") as file:
-            for ending, (offset, size) in places.items():
-                name = {"png": "image", "json": "info"}.get(ending, ending.partition(".")[0])
-                if names is None or name in names:
-                    file.seek(offset)
-                    sample[name] = _decode(ending, file.read(size))
         return sample
 
     def _found_places(self) -> list[tuple[str, dict[str, tuple[int, int]]]]:
@@ -258,19 +246,18 @@ def load_dataset(folder: str | Path, *, split: Split | None = None, names: Seque
     folder = Path(folder)
     if split is not None and split not in SPLITS:
         raise DescriptionError(f"unknown split '{split}'; known are {', '.join(SPLITS)}")
-    advice = (
-        "" if (folder / CARD).is_file() else f"; is {folder} a finished data set? run twin dataset again to complete it"
-    )
+    card_file = folder / CARD
     try:
         card = read_model(
-            folder / CARD, DataCard, file_format=CARD_FORMAT, version=CARD_VERSION, called="card of a data set"
+            card_file, DataCard, file_format=CARD_FORMAT, version=CARD_VERSION, called="card of a data set"
         )
     except CaptureError as error:
-        raise CaptureError(f"{error}{advice}") from error
+        advice = f"; is {folder} a finished data set? run twin dataset again to complete it"
+        raise CaptureError(f"{error}{'' if card_file.is_file() else advice}") from error
     for shard in card.shards:
         # Only plain file names are allowed, because a path could lead outside the folder.
         if Path(shard.name).name != shard.name or Path(shard.name).suffix != SUFFIX:
-            raise CaptureError(f"{folder / CARD} names a shard '{shard.name}', which is not a file of a data set")
+            raise CaptureError(f"{card_file} names a shard '{shard.name}', which is not a file of a data set")
     known = {"image", "info", *card.labels}
     if names is not None and (unknown := set(names) - known):
         raise DescriptionError(

@@ -1,7 +1,5 @@
 """E57 (ASTM E2807): points in m with intensity, colour, image and line."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -13,36 +11,40 @@ from uwlts.storage.cloud import FARTHEST_SINGLE_MM, FEW_ZEROS, PointCloud, find_
 from uwlts.storage.las_file import describe_units, load_library, shorten_error
 from uwlts.storage.number_tables import Unit
 
-COLOURS = "colorRed", "colorGreen", "colorBlue"  # columns of the standard for 8 bits of each colour
 
-
-def write_e57(path: Path, points_mm: np.ndarray, columns: dict[str, np.ndarray], *, to: Path) -> None:
-    """Write points as one scan, with real numbers of 32 bits.
-
-    ``columns`` hold columns (N,) by the names of the standard. ``to`` is the final name of the file.
-
-    Raises OutputError if a point is farther than 16 m from the origin, or writing fails; SetupError if pye57 is not
-    installed.
-    """
-    pye57 = load_library("pye57", "E57")
-    if np.abs(points_mm).max() > FARTHEST_SINGLE_MM:
+def write_e57(aside: Path, cloud: PointCloud, colours: np.ndarray | None, path: Path) -> None:
+    """Write points as one scan, with real numbers of 32 bits; columns have the names of the standard (ASTM E2807)."""
+    unknown = np.isnan(cloud.intensity)
+    if unknown.any() and not unknown.all():
         raise OutputError(
-            f"cannot write {to}: points are {np.abs(points_mm).max() / 1e3:.6g} m from the origin, where 32-bit "
+            f"{np.count_nonzero(unknown)} of {len(cloud)} points have no intensity, which this program's E57 cannot "
+            "mark: write PLY, XYZ or LAZ"
+        )
+    pye57 = load_library("pye57", "E57")
+    if (farthest := np.abs(cloud.points_mm).max()) > FARTHEST_SINGLE_MM:
+        raise OutputError(
+            f"cannot write {path}: points are {farthest / 1e3:.6g} m from the origin, where 32-bit "
             "numbers are coarser than a micrometre: write HDF5, PLY or LAZ, or move the cloud"
         )
     # Rounded first, so that the bounds in the file apply to the numbers in the file.
-    coordinates = (1e-3 * points_mm).astype(np.float32).astype(np.float64).T
-    fields = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), coordinates, strict=True)) | columns
+    coordinates = (1e-3 * cloud.points_mm).astype(np.float32).astype(np.float64).T
+    columns = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), coordinates, strict=True))
+    if not unknown.any():
+        columns["intensity"] = cloud.intensity
+    if colours is not None:
+        columns |= dict(zip(("colorRed", "colorGreen", "colorBlue"), colours.T, strict=True))
+    if all(numbers.min() >= 0 and numbers.max() < 2**16 for numbers in (cloud.frame, cloud.line)):
+        columns |= {"columnIndex": cloud.frame.astype(np.uint16), "rowIndex": cloud.line.astype(np.uint16)}
     file: Any = None
     try:
-        with (file := pye57.E57(str(path), mode="w")):
-            file.write_scan_raw({label: np.ascontiguousarray(each) for label, each in fields.items()}, name=to.stem)
+        with (file := pye57.E57(str(aside), mode="w")):
+            file.write_scan_raw({name: np.ascontiguousarray(each) for name, each in columns.items()}, name=path.stem)
     except pye57.libe57.E57Exception as error:
         # The library closes its file again when it is deleted.
         if file is not None:
             file.close = lambda: None
         full = " (is the disk full?)" if "ErrorWriteFailed" in str(error) else ""
-        raise OutputError(f"cannot write {to}: {shorten_error(error).partition(' ****')[0]}{full}") from error
+        raise OutputError(f"cannot write {path}: {shorten_error(error).partition(' ****')[0]}{full}") from error
 
 
 def read_e57(path: Path, unit: Unit | None = None) -> PointCloud:

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 FORMAT = "uwlts-figures"
 VERSION = 1  # of the file format
-_HEAD = "scan", "calibration", "figure", "U / mm", "found", "within U"
 _NUMBER = re.compile(r" (sphere \d+|\d+-\d+|[XYZ])$")
 """Sphere, pair of spheres or axis at the end of a figure's name."""
 
@@ -139,15 +138,10 @@ class FigureTable(Brief, BaseModel, frozen=True):
         self, *, campaign: str | None = None, scan: str | None = None, method: str | None = None, figure: str = ""
     ) -> FigureTable:
         """Return the rows with the given campaign, scan and method, whose figure's name begins with ``figure``."""
-        wanted = {"campaign": campaign, "scan": scan, "method": method}
-        given = {name: value for name, value in wanted.items() if value is not None}
-        return FigureTable(
-            rows=tuple(
-                row
-                for row in self.rows
-                if row.figure.startswith(figure) and all(getattr(row, name) == given[name] for name in given)
-            )
-        )
+        rows = [row for row in self.rows if row.figure.startswith(figure)]
+        for name, value in (("campaign", campaign), ("scan", scan), ("method", method)):
+            rows = [row for row in rows if value in (None, getattr(row, name))]
+        return FigureTable(rows=tuple(rows))
 
     def errors(self) -> tuple[FigureErrors, ...]:
         """Return the errors with a stated uncertainty, by scan, method and figure in the order of the rows."""
@@ -196,4 +190,5 @@ def _group_errors(rows: Sequence[MeasuredFigure], keys: Sequence[tuple[str, str,
 
 def format_errors(groups: Iterable[FigureErrors]) -> list[str]:
     """Return errors as lines of text: stated uncertainty, twice the rms error, and the number within."""
-    return align_columns([_HEAD, *(each.texts() for each in groups)], right=(3, 4))
+    head = "scan", "calibration", "figure", "U / mm", "found", "within U"
+    return align_columns([head, *(each.texts() for each in groups)], right=(3, 4))

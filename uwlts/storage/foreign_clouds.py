@@ -8,14 +8,12 @@ from typing import Literal
 
 import numpy as np
 
-from uwlts.errors import CaptureError, DescriptionError, OutputError
-from uwlts.files.writing import write_atomically
-from uwlts.storage.cloud import PointCloud, find_float_step, make_foreign_cloud
-from uwlts.storage.e57_file import COLOURS, read_e57, write_e57
-from uwlts.storage.las_file import encode_las, load_library, read_las
-from uwlts.storage.normal_std import compute_normal_std
+from uwlts.errors import CaptureError, DescriptionError
+from uwlts.storage.cloud import PointCloud, compute_normal_std, find_float_step, make_foreign_cloud
+from uwlts.storage.e57_file import read_e57, write_e57
+from uwlts.storage.las_file import encode_las, read_las
 from uwlts.storage.number_tables import Unit, read_number_table
-from uwlts.storage.point_cloud2 import covariance_columns, mcap_content, read_bag_cloud
+from uwlts.storage.ros_messages import covariance_columns, mcap_content, read_bag_cloud
 
 Colours = np.ndarray | None
 
@@ -40,19 +38,6 @@ def find_format(path: str | os.PathLike[str]) -> CloudFormat | None:
     return FORMATS.get(Path(path).suffix.lower())
 
 
-def read_foreign(path: Path, *, unit: Unit | None = None) -> PointCloud:
-    """Read all points of a file in one of `FORMATS`.
-
-    Text is in the unit that the names of its columns state, else in ``unit``, by default mm; LAS,
-    LAZ and E57 are in m, as they prescribe. The scans of an E57 file are combined, each at its pose.
-
-    Raises CaptureError if the file is damaged or foreign, SetupError if the library for its format is not installed.
-    """
-    form = find_format(path)
-    assert form is not None
-    return form.read(path, unit)
-
-
 def _read_text(path: Path, unit: Unit | None) -> PointCloud:
     try:
         table = read_number_table(path, named=False)
@@ -70,27 +55,6 @@ def _read_text(path: Path, unit: Unit | None) -> PointCloud:
     return replace(cloud, warnings=[*table.notes, *cloud.warnings])
 
 
-def write_foreign(path: Path, cloud: PointCloud, *, overwrite: bool, colours: Colours = None) -> None:
-    """Write a cloud in one of `FORMATS`, by the path's ending, completely or not at all.
-
-    Raises OutputError if the file exists, the cloud is empty, too wide for LAS, or lacks some intensities in E57, or
-    writing fails; SetupError if the format's library is not installed.
-    """
-    if len(cloud) == 0:
-        raise OutputError(f"the cloud has no points, and {path.suffix} cannot hold none: write PLY or HDF5")
-    form = find_format(path)
-    assert form is not None and form.write is not None
-    with write_atomically(path, overwrite=overwrite) as aside:
-        form.write(aside, cloud, colours, path)
-
-
-def require_libraries(path: Path) -> None:
-    """Raise SetupError if a library for writing a file with this ending is not installed."""
-    form = find_format(path)
-    for name in () if form is None else form.libraries:
-        load_library(name, path.suffix.strip(".").upper())
-
-
 def _write_text(aside: Path, cloud: PointCloud, colours: Colours, path: Path) -> None:
     rows = zip(*cloud.points_mm.T.tolist(), cloud.intensity, strict=True)
     with open(aside, "w", encoding="utf-8") as file:
@@ -100,51 +64,33 @@ def _write_text(aside: Path, cloud: PointCloud, colours: Colours, path: Path) ->
 
 
 def _write_las(aside: Path, cloud: PointCloud, colours: Colours, path: Path) -> None:
-    fields = {"amplitude": cloud.intensity, "frame": cloud.frame, "line": cloud.line}
-    if cloud.deviation_mm is not None:
-        fields["deviation_mm"] = cloud.deviation_mm
-    fields |= _uncertainty_columns(cloud)
+    random, common = compute_normal_std(cloud)
+    fields = {
+        "amplitude": cloud.intensity,
+        "frame": cloud.frame,
+        "line": cloud.line,
+        "deviation_mm": cloud.deviation_mm,
+    }
+    fields |= covariance_columns(cloud) | {"random_std_mm": random, "common_std_mm": common}
+    known = {name: values for name, values in fields.items() if values is not None}
     compressed = path.suffix.lower() == ".laz"
-    content = encode_las(
-        cloud.points_mm, cloud.intensity, fields, time_s=cloud.time_s, colours=colours, compressed=compressed
+    aside.write_bytes(
+        encode_las(cloud.points_mm, cloud.intensity, known, time_s=cloud.time_s, colours=colours, compressed=compressed)
     )
-    aside.write_bytes(content)
-
-
-def _uncertainty_columns(cloud: PointCloud) -> dict[str, np.ndarray]:
-    """Return the known columns (N,) of the covariance, and of the random and common part along the surface normal."""
-    parts = zip(("random_std_mm", "common_std_mm"), compute_normal_std(cloud), strict=True)
-    return covariance_columns(cloud) | {name: values for name, values in parts if values is not None}
-
-
-def _write_mcap(aside: Path, cloud: PointCloud, colours: Colours, path: Path) -> None:
-    aside.write_bytes(mcap_content(cloud))
-
-
-def _write_e57(aside: Path, cloud: PointCloud, colours: Colours, path: Path) -> None:
-    unknown = np.isnan(cloud.intensity)
-    if unknown.any() and not unknown.all():
-        raise OutputError(
-            f"{np.count_nonzero(unknown)} of {len(cloud)} points have no intensity, which this program's E57 cannot "
-            "mark: write PLY, XYZ or LAZ"
-        )
-    columns = {} if unknown.any() else {"intensity": cloud.intensity}
-    if colours is not None:
-        columns |= dict(zip(COLOURS, colours.T, strict=True))
-    if all(numbers.min() >= 0 and numbers.max() < 2**16 for numbers in (cloud.frame, cloud.line)):
-        columns |= {"columnIndex": cloud.frame.astype(np.uint16), "rowIndex": cloud.line.astype(np.uint16)}
-    write_e57(aside, cloud.points_mm, columns, to=path)
 
 
 FORMATS = {
     ".xyz": CloudFormat(_read_text, _write_text),
     ".laz": CloudFormat(read_las, _write_las, libraries=("laspy", "lazrs"), coloured=True, unit="m"),
-    ".e57": CloudFormat(read_e57, _write_e57, libraries=("pye57",), coloured=True, unit="m"),
+    ".e57": CloudFormat(read_e57, write_e57, libraries=("pye57",), coloured=True, unit="m"),
     ".las": CloudFormat(read_las, _write_las, libraries=("laspy",), coloured=True, unit="m"),
-    ".mcap": CloudFormat(read_bag_cloud, _write_mcap, unit="m", ambiguous=True),
+    ".mcap": CloudFormat(
+        read_bag_cloud, lambda aside, cloud, *_: aside.write_bytes(mcap_content(cloud)), unit="m", ambiguous=True
+    ),
     ".bag": CloudFormat(read_bag_cloud, unit="m", ambiguous=True),
     ".txt": CloudFormat(_read_text, ambiguous=True),
     ".csv": CloudFormat(_read_text, ambiguous=True),
     ".asc": CloudFormat(_read_text, ambiguous=True),
 }
-"""Formats by the file's ending. Text has columns x, y, z by name, or the first three, and optionally intensity."""
+"""Formats by the file's ending. Text has columns x, y, z by name, or the first three, and optionally intensity. Its
+unit is that in these names, else the given one, by default mm."""

@@ -4,26 +4,26 @@ The label consists of the attributes ``format``, ``version`` and ``header`` (JSO
 protected by HDF5's checksums. Variable-length text is not: if it is damaged, HDF5 may search for its end forever.
 """
 
-import io
+import ctypes
 import json
 import math
 import os
-from contextlib import ExitStack
+from collections.abc import Mapping
+from contextlib import suppress
+from io import BytesIO
 from pathlib import Path
 from types import EllipsisType
-from typing import TYPE_CHECKING, TypeVar
+from typing import Any, TypeVar
 
 import h5py
 import numpy as np
+from pydantic import JsonValue
 
 from uwlts.errors import CaptureError, Error
 from uwlts.files.reading import MOST_JSON_BYTES, is_regular_file, parse_json
+from uwlts.files.writing import write_atomically
 from uwlts.model.library import validate_description
 from uwlts.model.sensor import Description, Table
-
-if TYPE_CHECKING:
-    from typing_extensions import Buffer
-
 
 AnyHeader = TypeVar("AnyHeader", bound=Description)
 
@@ -46,6 +46,29 @@ def write_label(file: h5py.File, *, file_format: str, version: int, header: Desc
     file.attrs["header"] = np.bytes_(header.model_dump_json().encode())
 
 
+def write_arrays(
+    path: str | Path,
+    arrays: Mapping[str, np.ndarray | None],
+    *,
+    file_format: str,
+    version: int,
+    header: Description,
+    overwrite: bool,
+) -> None:
+    """Write a labelled file with compressed arrays, without those that are None, completely or not at all."""
+    # Written in memory first: HDF5 does not survive a full disk. Its latest format protects all metadata by checksums.
+    content = BytesIO()
+    with h5py.File(content, "w", libver="latest") as file:
+        write_label(file, file_format=file_format, version=version, header=header)
+        for name, data in arrays.items():
+            if data is not None:
+                file.create_dataset(
+                    name, data=data, compression="gzip", compression_opts=1, shuffle=True, fletcher32=True
+                )
+    with write_atomically(path, overwrite=overwrite) as aside:
+        aside.write_bytes(content.getbuffer())
+
+
 def read_label(
     file: h5py.File, model: type[AnyHeader], *, path: str | Path, file_format: str, version: int
 ) -> AnyHeader:
@@ -59,7 +82,7 @@ def read_label(
     if found != file_format:
         called = "it has no format" if found is None else f"its format is {found!r}"
         raise CaptureError(f"{path} is HDF5, but not what is expected here: {called}, expected '{file_format}'")
-    number = _number(file, "version")
+    number = _attribute(file, "version", "iu")
     if number is None or number < 1:
         found = "no number" if number is None else number
         raise CaptureError(f"{path} is damaged: its version is {found}, expected a whole number from 1")
@@ -67,14 +90,18 @@ def read_label(
         raise CaptureError(f"{path} has version {number}; this program reads up to {version}: update it")
     if (header := _text(file, "header")) is None:
         raise CaptureError(f"{path} is damaged: its header is missing")
-    try:
-        content = parse_json(header)
-    except ValueError as error:
-        raise CaptureError(f"{path} is damaged: its header is not JSON: {error}") from error
+    content = _parse(header, f"{path} is damaged: its header")
     try:
         return validate_description(model, content, f"the header of {path}")
     except Error as error:
         raise CaptureError(str(error)) from error
+
+
+def _parse(text: str, called: str) -> JsonValue:
+    try:
+        return parse_json(text)
+    except ValueError as error:
+        raise CaptureError(f"{called} is not JSON: {error}") from error
 
 
 def write_plan(file: h5py.File, plan: Table) -> None:
@@ -86,10 +113,7 @@ def read_plan(file: h5py.File) -> Table | None:
     """Return the plan of an unfinished file, or None; raises CaptureError if it is damaged."""
     if (text := _text(file, "plan")) is None:
         return None
-    try:
-        plan = parse_json(text)
-    except ValueError as error:
-        raise CaptureError(f"{file.filename} is damaged: its plan is not JSON: {error}") from error
+    plan = _parse(text, f"{file.filename} is damaged: its plan")
     if not isinstance(plan, dict):
         raise CaptureError(f"{file.filename} is damaged: its plan is not a table")
     return plan
@@ -117,21 +141,17 @@ def read_format(path: str | Path) -> str | None:
 
 def _text(file: h5py.File, name: str) -> str | None:
     """Return an attribute's text, or None if it is missing or of another kind."""
-    if name not in file.attrs:
-        return None
-    known = file.attrs.get_id(name)
-    if known.dtype.kind != "S" or known.shape != () or known.dtype.itemsize > MOST_JSON_BYTES:
-        return None
-    value = file.attrs[name]
+    value = _attribute(file, name, "S")
     return value.decode() if isinstance(value, bytes) else None
 
 
-def _number(file: h5py.File, name: str) -> int | None:
-    """Return an attribute's integer, or None if it is missing or of another kind."""
+def _attribute(file: h5py.File, name: str, kinds: str) -> Any:
+    """Return an attribute that is a single value of some kinds; None if it is missing, another or too large."""
     if name not in file.attrs:
         return None
     known = file.attrs.get_id(name)
-    return int(np.asarray(file.attrs[name])) if known.dtype.kind in "iu" and known.shape == () else None
+    usable = known.dtype.kind in kinds and known.shape == () and known.dtype.itemsize <= MOST_JSON_BYTES
+    return file.attrs[name] if usable else None
 
 
 def find_dataset(file: h5py.File, name: str, *, path: str | Path) -> h5py.Dataset | None:
@@ -188,86 +208,28 @@ def require_small_chunks(dataset: h5py.Dataset, name: str, *, path: str | Path) 
 
 
 _SIGNATURE_AND_VERSION = b"\x89HDF\r\n\x1a\n\x03"
-# Superblock version 3 with 8-byte offsets (HDF5 File Format Specification 3.0, II.A): offsets of its entries.
-_FLAGS, _END_OF_FILE, _ROOT, _CHECKSUM, _SIZE = 11, 28, 36, 44, 48
-_ROOM = 2**28
-"""Largest growth of a file in bytes while it is read."""
+_FLAGS = 11  # place of the writer's mark in superblock version 3 (HDF5 File Format Specification 3.0, II.A)
+
+_ATTEMPTS = 20
+"""Attempts to read metadata that is being written. HDF5 doubles its pause from 1 ns each time: all take a millisecond,
+and its usual hundred, at damage, for ever."""
 
 
 def has_writer(path: str | Path) -> bool:
     """Return whether the file is marked as open for writing, now or when its writer was killed."""
     with open(path, "rb") as file:
-        start = file.read(_SIZE)
-    return len(start) == _SIZE and start.startswith(_SIGNATURE_AND_VERSION) and start[_FLAGS] != 0
+        start = file.read(_FLAGS + 1)
+    return len(start) > _FLAGS and start.startswith(_SIGNATURE_AND_VERSION) and start[_FLAGS] != 0
 
 
-class UnfinishedFile(h5py.File):
-    """A file that is being written, or whose writer was killed, as last flushed; raises the errors of ``h5py.File``.
-
-    HDF5's single-writer-multiple-reader mode hangs on a damaged file: it tries a hundred times and doubles the pause
-    each time. Two entries of the superblock prevent a normal opening: the writer's mark and the end of the used space.
-    This class presents them to HDF5 as in a closed file; the file itself is not changed.
-    """
-
-    def __init__(self, path: str | Path):
-        with ExitStack() as opened:
-            self._view = opened.enter_context(_ClosedView(path))
-            super().__init__(self._view, "r")
-            opened.pop_all()
-
-    def close(self) -> None:
-        """Close the file."""
-        super().close()
-        self._view.close()
-
-
-class _ClosedView(io.FileIO):
-    """View of the file with the superblock that its writer would leave, and space for further data."""
-
-    def __init__(self, path: str | Path):
-        super().__init__(path, "r")
-        start = self.read(_SIZE)
-        self._end = os.fstat(self.fileno()).st_size + _ROOM
-        settled = start[:_FLAGS] + b"\0" + start[_FLAGS + 1 : _END_OF_FILE] + self._end.to_bytes(8, "little")
-        settled += start[_ROOT:_CHECKSUM]
-        # A damaged superblock is not corrected.
-        intact = lookup3(start[:_CHECKSUM]).to_bytes(4, "little") == start[_CHECKSUM:]
-        self._start = settled + lookup3(settled).to_bytes(4, "little") if intact else start
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Set the position; the end of the file is that of the corrected superblock."""
-        return super().seek(offset + self._end) if whence == os.SEEK_END else super().seek(offset, whence)
-
-    def readinto(self, buffer: "Buffer", /) -> int:
-        """Read bytes; the superblock is the corrected one, and bytes that are not written yet are zero."""
-        place, position = memoryview(buffer).cast("B"), self.tell()
-        count = super().readinto(place)
-        place[count:] = bytes(len(place) - count)
-        settled = self._start[position : position + len(place)]
-        place[: len(settled)] = settled
-        return len(place)
-
-
-def lookup3(data: bytes) -> int:
-    """Return HDF5's metadata checksum: ``hashlittle`` of Bob Jenkins' lookup3.c (2006, public domain), seed 0."""
-
-    def rotate(value: int, bits: int) -> int:
-        return ((value << bits) | (value >> (32 - bits))) & 0xFFFFFFFF
-
-    a = b = c = (0xDEADBEEF + len(data)) & 0xFFFFFFFF
-    blocks = max(0, -(-len(data) // 12))
-    words = data.ljust(12 * blocks, b"\0")
-    for block in range(blocks):
-        x, y, z = (int.from_bytes(words[12 * block + k : 12 * block + k + 4], "little") for k in (0, 4, 8))
-        a, b, c = (a + x) & 0xFFFFFFFF, (b + y) & 0xFFFFFFFF, (c + z) & 0xFFFFFFFF
-        if block < blocks - 1:
-            for bits in (4, 6, 8, 16, 19, 4):
-                a = ((a - c) & 0xFFFFFFFF) ^ rotate(c, bits)
-                c = (c + b) & 0xFFFFFFFF
-                a, b, c = b, c, a
-        else:
-            for bits in (14, 11, 25, 16, 4, 14, 24):
-                c = ((c ^ b) - rotate(b, bits)) & 0xFFFFFFFF
-                a, b, c = b, c, a
-    # The last of the seven steps stored c in b.
-    return b
+def open_unfinished(path: str | Path) -> h5py.File:
+    """Open a file that is being written, or whose writer was killed, as last flushed; raises like ``h5py.File``."""
+    access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
+    access.set_fclose_degree(h5py.h5f.CLOSE_STRONG)
+    access.set_file_locking(False, True)
+    # h5py has no function for this setting; its module is linked with the library.
+    with suppress(AttributeError):
+        set_attempts = ctypes.CDLL(h5py.h5p.__file__).H5Pset_metadata_read_attempts
+        set_attempts(ctypes.c_int64(access.id), ctypes.c_uint(_ATTEMPTS))
+    mode = h5py.h5f.ACC_RDONLY | h5py.h5f.ACC_SWMR_READ
+    return h5py.File(h5py.h5f.open(os.fsencode(path), mode, fapl=access))

@@ -21,7 +21,6 @@ LAZ_STEP_M = 1e-7
 """Resolution of coordinates in LAZ, integers relative to the middle of the cloud: up to 214 m to either side."""
 
 _REACH_M = LAZ_STEP_M * (2**31 - 1)  # of 32-bit coordinates
-_INTENSITY_LIMITS = 0, 2**16 - 1  # 16 bits
 _NOISE_CLASSES = 7, 18  # low and high noise
 _BOX_MARGIN = 1e-3  # distance of points outside the stated box that is allowed, in its longest edges
 _LONGEST_HEADER = 375  # bytes (LAS 1.4, table 3)
@@ -112,19 +111,26 @@ def encode_las(
 ) -> bytes:
     """Return the content of a LAS or LAZ file (``compressed``) of points (N, 3).
 
-    Intensities (N,) are stored as integers of 16 bits, ``fields`` (N,) by name as extra fields.
+    Intensities (N,) are stored as integers of 16 bits, ``fields`` (N,) by name as extra fields. Raises OutputError if
+    the cloud is too wide.
     """
     laspy = load_library("laspy", "LAZ" if compressed else "LAS")
     if compressed:
         load_library("lazrs", "LAZ")
     points = 1e-3 * points_mm
-    middle = _las_middle(points.min(axis=0), points.max(axis=0))
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle = np.round((low + high) / 2, 3)
+    if not (reach := max(np.abs(low - middle).max(), np.abs(high - middle).max())) <= _REACH_M:
+        raise OutputError(
+            f"the cloud reaches {reach:.9g} m from its middle, LAZ in steps of {LAZ_STEP_M:g} m "
+            f"only {_REACH_M:.0f} m: write PLY or HDF5"
+        )
     header = laspy.LasHeader(version="1.4", point_format=6 if colours is None else 7)
     header.offsets, header.scales = middle, np.full(3, LAZ_STEP_M)
     header.add_extra_dims([laspy.ExtraBytesParams(name=name, type=values.dtype) for name, values in fields.items()])
     table = laspy.LasData(header)
     table.x, table.y, table.z = points.T
-    table.intensity = np.rint(np.nan_to_num(intensity)).clip(*_INTENSITY_LIMITS).astype(np.uint16)
+    table.intensity = np.rint(np.nan_to_num(intensity)).clip(0, 2**16 - 1).astype(np.uint16)
     if time_s is not None:
         table.gps_time = time_s
     if colours is not None:
@@ -136,18 +142,6 @@ def encode_las(
     content = BytesIO()
     table.write(content, do_compress=compressed)
     return content.getvalue()
-
-
-def _las_middle(low_m: np.ndarray, high_m: np.ndarray) -> np.ndarray:
-    """Return the middle (3,) of a cloud in m, the origin of its coordinates; raises OutputError if it is too wide."""
-    middle = np.round((low_m + high_m) / 2, 3)
-    reach = max(np.abs(low_m - middle).max(), np.abs(high_m - middle).max())
-    if not reach <= _REACH_M:
-        raise OutputError(
-            f"the cloud reaches {reach:.9g} m from its middle, LAZ in steps of {LAZ_STEP_M:g} m "
-            f"only {_REACH_M:.0f} m: write PLY or HDF5"
-        )
-    return middle
 
 
 def read_las(path: Path, unit: Unit | None = None) -> PointCloud:
@@ -176,7 +170,11 @@ def read_las(path: Path, unit: Unit | None = None) -> PointCloud:
         names = set(found.point_format.dimension_names)
         column = {name: np.asarray(found[name]) for name in names & {"frame", "line", "deviation_mm", "gps_time"}}
         intensity = np.asarray(found["amplitude" if "amplitude" in names else "intensity"], np.float32)
-        omitted = _unwanted_points(found)
+        # LAS 1.4, tables 8, 16 and 17
+        omitted = {
+            "marked as withheld": np.asarray(found.withheld, bool),
+            "classified as noise": np.isin(np.asarray(found.classification), _NOISE_CLASSES),
+        }
     except BaseException as error:
         # The decompressor, in Rust, panics at damaged chunks: the exception is no Exception.
         if isinstance(error, Exception) or type(error).__name__ == "PanicException":
@@ -324,14 +322,6 @@ def _is_scaled(stated: np.ndarray, found: np.ndarray, margin: np.ndarray, step: 
 def _numbers(values: np.ndarray) -> str:
     """Return numbers in a few digits, in brackets."""
     return f"({', '.join(f'{value:.5g}' for value in values.tolist())})"
-
-
-def _unwanted_points(found: Any) -> dict[str, np.ndarray]:
-    """Return masks (N,) of LAS points that are marked as unwanted, by reason (LAS 1.4, tables 8, 16 and 17)."""
-    return {
-        "marked as withheld": np.asarray(found.withheld, bool),
-        "classified as noise": np.isin(np.asarray(found.classification), _NOISE_CLASSES),
-    }
 
 
 def load_library(name: Literal["laspy", "lazrs", "pye57"], file_format: str) -> ModuleType:

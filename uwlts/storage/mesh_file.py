@@ -109,15 +109,11 @@ class SurfaceMesh(Brief):
             not set, or it cannot be written.
         """
         path = Path(path)
-        match path.suffix.lower():
-            case ".ply" | ".stl" | ".glb" as ending:
-                content = {".ply": _ply, ".stl": _stl, ".glb": _glb}[ending](self)
-                with write_atomically(path, overwrite=overwrite) as aside:
-                    aside.write_bytes(content)
-            case _:
-                raise OutputError(
-                    f"{path} ends with none of {', '.join(MESH_FORMATS)}, which name the format of a mesh"
-                )
+        if (encode := {".ply": _ply, ".stl": _stl, ".glb": _glb}.get(path.suffix.lower())) is None:
+            raise OutputError(f"{path} ends with none of {', '.join(MESH_FORMATS)}, which name the format of a mesh")
+        content = encode(self)
+        with write_atomically(path, overwrite=overwrite) as aside:
+            aside.write_bytes(content)
 
 
 def has_faces(path: Path) -> bool:

@@ -113,9 +113,10 @@ def choose_scale(stated: str, unit: Unit | None, path: Path, error: type[Error] 
 
     Raises ``error`` if both are given and differ.
     """
-    if unit is not None and stated and _LENGTHS[stated] != MM_PER_UNIT[check_unit(unit)]:
+    given = MM_PER_UNIT[check_unit(unit or "mm")]
+    if unit is not None and stated and _LENGTHS[stated] != given:
         raise error(f"{path} states {stated}, but the unit {unit} was given: leave the unit out, or correct the file")
-    return _LENGTHS[stated] if stated else MM_PER_UNIT[check_unit(unit or "mm")]
+    return _LENGTHS[stated] if stated else given
 
 
 def find_stated_unit(texts: Iterable[str]) -> tuple[str, list[str]]:
@@ -147,10 +148,13 @@ def _split_lines(
         lines = [line for line in lines if not line.startswith(_COMMENTS)]
     if not lines:
         raise DescriptionError(f"{path} is empty: expected a table of numbers")
-    lines, counted = _without_count(lines)
+    counted = None
+    if len(lines) > 1 and lines[0].isdigit() and len(lines[0]) < 12 and len(_split(lines[1])) > 1:
+        counted = int(lines.pop(0))
     lines, block = _without_block(lines)
     header = None
-    if not _is_row(lines[0]):
+    first = [cell.strip().strip(b'"') for cell in _split(lines[0])]
+    if any(first) and not any(map(_is_number, first)):
         header, *lines = lines
         if not lines:
             raise DescriptionError(f"{path} has no rows after the names of its columns")
@@ -191,7 +195,7 @@ def read_number_table(path: Path, digests: dict[str, str] | None = None, *, name
     content = _decode_wide(content, path)
     comments, block, header, unit_row, lines = _split_lines(content, path)
     delimiter, comma = _separators(lines[0])
-    count = len(_cells(lines[0], delimiter))
+    count = len(_split(lines[0], delimiter))
     cells = _find_names(header, unit_row, comments, delimiter, count, path)
     body = b"\n".join(lines) + b"\n"
     if delimiter == b" " and b"  " in body:
@@ -221,7 +225,7 @@ def read_number_table(path: Path, digests: dict[str, str] | None = None, *, name
         )
     stated, doubts = find_stated_unit(map(_text, [*block, *comments[:1000]]))
     notes += doubts if not units.keys() & set("xyz") else []
-    decimals = [_decimals(row) for row in zip(*(_cells(line, delimiter) for line in lines[:_FIRST]), strict=False)]
+    decimals = [_decimals(row) for row in zip(*(_split(line, delimiter) for line in lines[:_FIRST]), strict=False)]
     steps = {name: 10.0**-count for name, count in zip(names, decimals, strict=False) if count is not None}
     return NumberTable(path, columns, units, steps, notes, stated, directions, ", ".join(cells or names))
 
@@ -325,13 +329,6 @@ def _seems_decimal(lines: list[bytes]) -> bool:
     return plain and _FEWEST <= len(decimals) == len(lines) and len(lengths) > 2 and max(map(len, lengths)) == 1
 
 
-def _without_count(lines: list[bytes]) -> tuple[list[bytes], int | None]:
-    """Remove a first line with the number of rows alone, if the next line has more cells; return it too."""
-    counts = len(lines) > 1 and lines[0].isdigit() and len(lines[0]) < 12
-    counts = counts and len(_cells(lines[1], _separators(lines[1])[0])) > 1
-    return (lines[1:], int(lines[0])) if counts else (lines, None)
-
-
 def _without_block(lines: list[bytes]) -> tuple[list[bytes], list[bytes]]:
     """Remove lines that sensors write before the names of columns, and return them, too.
 
@@ -340,9 +337,9 @@ def _without_block(lines: list[bytes]) -> tuple[list[bytes], list[bytes]]:
     for number, line in enumerate(lines[:_LONGEST_BLOCK]):
         further = lines[number + 1 : number + 3]
         if row := next((each for each in further if not _is_unit_row(each)), None):
-            delimiter = _separators(row)[0]
-            count = len(cells := _cells(row, delimiter))
-            if all(not cell.strip() or _is_number(cell) for cell in cells) and _names_columns(line, delimiter, count):
+            cells, delimiter = _split(row), _separators(row)[0]
+            numbers = all(not cell.strip() or _is_number(cell) for cell in cells)
+            if numbers and _names_columns(line, delimiter, len(cells)):
                 return lines[number:], lines[:number]
     return lines, []
 
@@ -358,7 +355,9 @@ def _separators(line: bytes) -> tuple[bytes, bool]:
     return (b"," if b"," in line else b" "), False
 
 
-def _cells(line: bytes, delimiter: bytes) -> list[bytes]:
+def _split(line: bytes, delimiter: bytes = b"") -> list[bytes]:
+    """Return the cells of a line, by default by its own separator."""
+    delimiter = delimiter or _separators(line)[0]
     return line.split() if delimiter == b" " else line.split(delimiter)
 
 
@@ -367,12 +366,6 @@ def _decimals(cells: Iterable[bytes]) -> int | None:
     found = [_NUMBER.fullmatch(cell.strip().strip(b'"')) for cell in cells]
     known = [len(match[1] or b"") for match in found if match]
     return max(known) if known and len(known) == len(found) >= _FEWEST else None
-
-
-def _is_row(line: bytes) -> bool:
-    """Return whether one of the cells is a number."""
-    cells = [cell.strip().strip(b'"') for cell in _cells(line, _separators(line)[0])]
-    return any(_is_number(cell) for cell in cells) or not any(cells)
 
 
 def _is_number(text: bytes) -> bool:

@@ -13,7 +13,7 @@ from uwlts.files.writing import write_atomically
 from uwlts.model.calibration import is_rigid
 from uwlts.model.trajectory import COVARIANCE_COLUMNS, Trajectory
 from uwlts.storage.number_tables import ROTATION_NAMES, NumberTable, Unit, read_number_table
-from uwlts.storage.ros_bags import read_bag_poses
+from uwlts.storage.ros_messages import read_bag_poses
 
 PoseFormat = str
 """matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ORDER-deg or -rad, angle-deg,
@@ -26,13 +26,19 @@ FARTHEST_MM = 1e7
 _COMPASS = ("north", "east", "down")
 _ROUNDED = 2e-3
 """Deviation from a rigid matrix or a unit quaternion when numbers have three decimals."""
-_EULER = re.compile(r"euler-([xyz]{3}|[XYZ]{3})-(deg|rad)")
+_FORMAT = re.compile(
+    r"matrix|quaternion-(xyzw|wxyz)|(rotvec|angle)-(deg|rad)|euler-(?P<axes>[xyz]{3}|[XYZ]{3})-(deg|rad)"
+)
+_COLUMNS = {"matrix": (12, 16), "quaternion": (7,), "rotvec": (6,), "euler": (6,), "angle": (1,)}
+"""Numbers of columns of a pose, by the first word of the format."""
 _FORMATS = "matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-zyx-deg (fixed axes), euler-ZYX-deg"
 _FEWEST_POSES, _ALTERNATING, _RETURNED, _LEAST_JUMP_MM, _REACH_MM = 10, 0.2, 0.3, 0.1, 300.0
 """Two sources: least number of poses, share that jumps, largest distance after it relative to the jump, smallest jump,
 and lever of rotations. Of independent noise along one axis, 14 % jump, in a plane 6 %."""
 _NEAR_HALF_TURN = 3.0
 """Angles in rad reach pi, unless turns are small; the largest in deg is between 3 and pi by chance only."""
+_METRES = np.array([1e3] * 3 + [1.0] * 3)
+"""Units of shifts in m and rotations in rad, in mm and rad."""
 _MOST_POSES = 1_000_000  # more than an hour at 200 poses a second
 _LATEST_S = 1e11  # Unix times in s reach it in the year 5138; larger numbers are in ms, us or ns
 
@@ -73,7 +79,7 @@ def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", uni
     the quaternion x y z w, separated by blanks and without names. Columns named ``cov_00`` to ``cov_55`` are the upper
     triangles of the covariances (`Trajectory`), in the unit of the positions and rad. With the format ``ros`` the file
     is a bag of ROS 1 or ROS 2; ``ros:/TOPIC`` or ``ros:PARENT>CHILD`` names the poses or transforms in it
-    (`uwlts.storage.ros_bags`).
+    (`uwlts.storage.ros_messages`).
 
     Raises the errors of `read_poses` and `Trajectory`, DescriptionError if there are no times, and SetupError if the
     library for bags is not installed.
@@ -81,9 +87,7 @@ def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", uni
     path = Path(path)
     if pose_format == "ros" or pose_format.startswith("ros:"):
         times, rows, covariance = read_bag_poses(path, pose_format.removeprefix("ros").removeprefix(":"))
-        if covariance is not None:
-            units = np.array([1e3] * 3 + [1.0] * 3)
-            covariance = covariance * units[:, None] * units
+        covariance = None if covariance is None else covariance * np.outer(_METRES, _METRES)
         rows[:, :3] *= 1e3
         return _trajectory(path, times, poses_from_rows(rows, "quaternion-xyzw", path), covariance)
     table = read_number_table(path, named=False)
@@ -93,10 +97,8 @@ def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", uni
                 f"{path} has {len(table.columns)} columns; expected time, x, y, z and a quaternion (tum)"
             )
         if "time_s" not in table.columns:
-            first = next(iter(table.columns))
-            table = replace(
-                table, columns={"time_s" if name == first else name: c for name, c in table.columns.items()}
-            )
+            names = ["time_s", *[*table.columns][1:]]
+            table = replace(table, columns=dict(zip(names, table.columns.values(), strict=True)))
         pose_format, unit = "quaternion-xyzw", "m"
     covariance = _covariances(table.columns, path, table.mm_per_unit(unit=unit))
     poses, times = _poses(table, pose_format, unit)
@@ -138,7 +140,7 @@ def _covariances(columns: dict[str, np.ndarray], path: Path, mm_per_unit: float)
         return None
     if missing := sorted(COVARIANCE_COLUMNS.keys() - found.keys()):
         raise DescriptionError(f"{path} has columns of covariances, but not {', '.join(missing)}")
-    units = np.array([mm_per_unit] * 3 + [1.0] * 3)
+    units = np.where(_METRES > 1, mm_per_unit, 1.0)
     covariances = np.empty((len(next(iter(found.values()))), 6, 6))
     for name, (i, j) in COVARIANCE_COLUMNS.items():
         covariances[:, i, j] = covariances[:, j, i] = found[name] * units[i] * units[j]
@@ -277,19 +279,9 @@ def _order_names(names: list[str], pose_format: PoseFormat, path: Path) -> list[
 
 
 def poses_from_rows(rows: np.ndarray, pose_format: str, path: Path) -> np.ndarray:
-    euler = _EULER.fullmatch(pose_format)
-    counts = {
-        "matrix": (12, 16),
-        "quaternion-xyzw": (7,),
-        "quaternion-wxyz": (7,),
-        "rotvec-rad": (6,),
-        "rotvec-deg": (6,),
-        "angle-deg": (1,),
-        "angle-rad": (1,),
-    }
-    expected = (6,) if euler else counts.get(pose_format)
-    if expected is None:
+    if (known := _FORMAT.fullmatch(pose_format)) is None:
         raise DescriptionError(f"the format of the poses is {pose_format!r}; expected {_FORMATS}, or another order")
+    expected = _COLUMNS[pose_format.partition("-")[0]]
     if rows.shape[1] not in expected:
         raise DescriptionError(
             f"{path} has {rows.shape[1]} columns of numbers; a pose as {pose_format} has "
@@ -321,7 +313,8 @@ def poses_from_rows(rows: np.ndarray, pose_format: str, path: Path) -> np.ndarra
         if pose_format.endswith("-deg") and _NEAR_HALF_TURN < np.abs(turns).max(initial=0) < np.pi + 0.01:
             log_warnings(path, [f"angles are at most {np.abs(turns).max():.4g} deg: are they radians (-rad)?"])
         angles = np.radians(turns) if pose_format.endswith("-deg") else turns
-        rotations = Rotation.from_euler(euler[1], angles) if euler else Rotation.from_rotvec(angles)
+        axes = known["axes"]
+        rotations = Rotation.from_euler(axes, angles) if axes else Rotation.from_rotvec(angles)
     result[:, :3, :3] = rotations.as_matrix()
     return result
 

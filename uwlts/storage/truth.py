@@ -11,10 +11,9 @@ import numpy as np
 
 from uwlts.errors import CaptureError
 from uwlts.files.reading import require_regular_file
-from uwlts.files.writing import write_atomically
 from uwlts.model.sensor import Description, Medium, Sensor, Table
 from uwlts.model.short_text import Brief
-from uwlts.storage.hdf5_file import DAMAGE, read_array, read_label, write_label
+from uwlts.storage.hdf5_file import DAMAGE, read_array, read_label, write_arrays
 
 FORMAT = "uwlts-truth"
 VERSION = 1  # of the file format
@@ -82,13 +81,7 @@ def truth_path(capture: str | Path) -> Path:
 
 def write_truth(path: str | Path, header: TruthHeader, truth: Truth, *, overwrite: bool = False) -> None:
     """Write a truth file completely or not at all; raises OutputError if that fails."""
-    # HDF5's latest format protects all its metadata by checksums.
-    with write_atomically(path, overwrite=overwrite) as aside, h5py.File(aside, "w", libver="latest") as file:
-        write_label(file, file_format=FORMAT, version=VERSION, header=header)
-        for name, values in vars(truth).items():
-            if values is None:
-                continue
-            file.create_dataset(name, data=values, compression="gzip", compression_opts=1, fletcher32=True)
+    write_arrays(path, vars(truth), file_format=FORMAT, version=VERSION, header=header, overwrite=overwrite)
 
 
 def read_truth(path: str | Path) -> tuple[TruthHeader, Truth]:
@@ -97,10 +90,15 @@ def read_truth(path: str | Path) -> tuple[TruthHeader, Truth]:
     try:
         with h5py.File(path, "r") as file:
             header = read_label(file, TruthHeader, path=path, file_format=FORMAT, version=VERSION)
-            stored = [*_DIMENSIONS, *(name for name in _LATER if name in file)]
-            truth = Truth(**{name: _array(file, name, path) for name in stored})
+            stored = _DIMENSIONS | {name: count for name, count in _LATER.items() if name in file}
+            arrays = {name: read_array(file, name, path=path) for name in stored}
     except DAMAGE as error:
         raise CaptureError(f"{path} is not a truth file, or is damaged: {error}") from error
+    for name, dimensions in stored.items():
+        values, kinds = arrays[name], "iu" if name in ("status", "crossings") else "f"
+        if values is None or values.dtype.kind not in kinds or values.ndim != dimensions:
+            raise CaptureError(f"{path} is damaged: it has no numbers '{name}' in {dimensions} dimensions")
+    truth = Truth(**arrays)
     lines = truth.status.shape
     shapes = {name: getattr(truth, name).shape for name in stored if name not in ("depth_mm", "pose")}
     if shapes != {name: (*lines, 3) if name in ("point_mm", "normal") else lines for name in shapes}:
@@ -113,12 +111,3 @@ def read_truth(path: str | Path) -> tuple[TruthHeader, Truth]:
     if not all(np.isfinite(values[visible]).all() for values in (truth.centre_px, truth.point_mm, truth.normal)):
         raise CaptureError(f"{path} marks a stripe as visible where centre, point or normal are not finite")
     return header, truth
-
-
-def _array(file: h5py.File, name: str, path: str | Path) -> np.ndarray:
-    values = read_array(file, name, path=path)
-    kinds = "iu" if name in ("status", "crossings") else "f"
-    dimensions = (_DIMENSIONS | _LATER)[name]
-    if values is None or values.dtype.kind not in kinds or values.ndim != dimensions:
-        raise CaptureError(f"{path} is damaged: it has no numbers '{name}' in {dimensions} dimensions")
-    return values

@@ -15,7 +15,7 @@ from tests.uwlts.reconstruction.test_reconstruct import CALIBRATION, write
 from uwlts.cli import app
 from uwlts.errors import CaptureError, OutputError
 from uwlts.evaluation.evaluate import FORMAT, VERSION, read_evaluation
-from uwlts.files.json_files import RecordFile, compute_seal, read_json, write_model, write_record
+from uwlts.files.json_files import compute_seal, read_json, write_model, write_record
 
 
 def _written(kind: str, folder: Path) -> Path:
@@ -104,14 +104,9 @@ def test_a_file_without_seal_is_treated_as_an_edited_one(tmp_path, caplog):
     assert "has no seal" in caplog.text
 
 
-class _Found(RecordFile):
-    def record(self) -> object:
-        return {"depth_mm": 1.25, "by_number": {10: 1, 9: 2}, "name": "hull ☃"}
-
-
 def test_records_are_sealed_too(tmp_path, caplog):
     path = tmp_path / "found.json"
-    _Found().save(path)
+    write_record(path, {"depth_mm": 1.25, "by_number": {10: 1, 9: 2}, "name": "hull ☃"}, overwrite=False)
     content = read_json(path, called="record")
     assert content["sha256"] == compute_seal(content) and content["depth_mm"] == 1.25
     path.write_text(path.read_text().replace("1.25", "1.35"))

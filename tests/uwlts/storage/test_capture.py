@@ -21,7 +21,7 @@ from uwlts.model.sensor import Sensor
 from uwlts.storage import capture_writer
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
-from uwlts.storage.hdf5_file import has_writer, lookup3, read_label, write_label
+from uwlts.storage.hdf5_file import has_writer, read_label, write_label
 
 ROOT = Path(__file__).resolve().parents[3]
 HEIGHT, WIDTH = 20, 24
@@ -754,17 +754,6 @@ def test_random_damage_gives_only_known_errors(tmp_path: Path, valid: bytes, kil
 
 
 # --- internal functions
-
-
-def test_checksum_is_the_one_of_lookup3():
-    """Values printed by the self test of Bob Jenkins' lookup3.c (driver5), and HDF5's own superblock."""
-    assert lookup3(b"") == 0xDEADBEEF
-    assert lookup3(b"Four score and seven years ago") == 0x17770551
-
-
-def test_superblock_checksum(valid: bytes, killed: bytes):
-    for content in (valid, killed):
-        assert lookup3(content[:44]) == int.from_bytes(content[44:48], "little")
 
 
 def test_label_is_read_without_the_rest(tmp_path: Path, valid: bytes):

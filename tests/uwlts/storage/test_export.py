@@ -22,7 +22,7 @@ from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import CLOUD_FORMATS, COLOURED_FORMATS, read_cloud, write_cloud
 from uwlts.storage.export_ import export, export_capture
 from uwlts.storage.foreign_clouds import FORMATS
-from uwlts.storage.import_ import import_images
+from uwlts.storage.import_.folder import import_images
 from uwlts.storage.las_file import LAZ_STEP_M
 
 

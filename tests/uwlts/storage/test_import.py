@@ -16,8 +16,8 @@ from uwlts.runtime.console import run
 from uwlts.storage.capture import NO_STAGE, Capture, part_path
 from uwlts.storage.export_ import export
 from uwlts.storage.image_file import SUFFIXES, read_image
-from uwlts.storage.import_ import import_images
-from uwlts.storage.import_.grey_values import extract_channel, grey_values
+from uwlts.storage.import_.folder import import_images
+from uwlts.storage.import_.grey_values import extract_channel
 from uwlts.storage.import_.matching import read_rows
 from uwlts.stripe import extract_stripe
 
@@ -252,11 +252,6 @@ def test_what_is_no_formula_of_channels_is_refused(tmp_path: Path, formula):
     refused(folder, tmp_path, DescriptionError, "channel: .*expected red, green, blue")
 
 
-def test_a_grey_image_has_no_difference_of_colours(tmp_path: Path):
-    folder = folder_of(tmp_path, {"l1.png": np.full(SHAPE, 9, np.uint8)}, GIVEN | {"channel": "red - green"})
-    refused(folder, tmp_path, ImageError, "l1.png has no colours")
-
-
 def test_colour_without_colours_needs_no_channel():
     image = stripe_image()
     assert np.array_equal(extract_channel(np.dstack([image] * 3), None, name="a"), image)
@@ -462,26 +457,45 @@ def test_foreign(tmp_path: Path, content: bytes, words: str):
     refused(folder, tmp_path, ImageError, f"l2.png is no PNG, TIFF, BMP or JPEG image: {words}")
 
 
-def test_wrong_size_in_the_middle(tmp_path: Path):
-    folder = three(tmp_path, l2=stripe_image()[:, :-2])
-    refused(folder, tmp_path, ImageError, "l2.png has 94 x 64 pixels; expected 96 x 64 .* and the images before it")
+WHITE = np.where(np.arange(HEIGHT)[:, None] < HEIGHT // 3, 200, np.full(SHAPE, 255)).astype(np.uint8)
 
 
-def test_wrong_size_from_the_start(tmp_path: Path):
-    folder = folder_of(tmp_path, {"l1.png": stripe_image()[:-2]})
-    refused(folder, tmp_path, ImageError, "96 x 62 pixels; expected 96 x 64 .*sensor that took the images")
+@pytest.mark.parametrize(
+    ("image", "words"),
+    [
+        (stripe_image()[:, :-2], "has 94 x 64 pixels; expected 96 x 64 .* and the images before it"),
+        (stripe_image().T, "has 64 x 96 .*it is rotated by 90 deg"),
+        (stripe_image().astype(np.uint16), "contains uint16, the images before it contain uint8"),
+        (WHITE, "is white: 67 % of its pixels are saturated"),
+        (np.dstack([stripe_image()] * 4), "has 4 channels, including an alpha channel"),
+        (np.dstack([stripe_image(), lamp_image(), lamp_image()]), "is a colour image: choose the channel"),
+    ],
+)
+def test_an_image_unlike_the_others_is_refused(tmp_path: Path, image: np.ndarray, words: str):
+    refused(three(tmp_path, l2=image), tmp_path, ImageError, f"l2.png {words}")
 
 
-def test_rotated(tmp_path: Path):
-    folder = folder_of(tmp_path, {"l1.png": stripe_image().T})
-    refused(folder, tmp_path, ImageError, "64 x 96 pixels; .* rotated by 90 deg: rotate them back, or exchange")
-    folder = three(tmp_path, l2=stripe_image().T)
-    refused(folder, tmp_path, ImageError, "l2.png has 64 x 96 .*it is rotated by 90 deg")
-
-
-def test_another_depth_in_the_middle(tmp_path: Path):
-    folder = three(tmp_path, l2=stripe_image().astype(np.uint16))
-    refused(folder, tmp_path, ImageError, "l2.png contains uint16, the images before it contain uint8")
+@pytest.mark.parametrize(
+    ("image", "given", "words"),
+    [
+        (stripe_image()[:-2], {}, "96 x 62 pixels; expected 96 x 64 .*sensor that took the images"),
+        (stripe_image().T, {}, "64 x 96 pixels; .* rotated by 90 deg: rotate them back, or exchange"),
+        (np.full(SHAPE, 1023, np.uint16), {"bits": 10}, "is white: 100 % .*1023 DN"),
+        (stripe_image().astype(np.uint16), {}, "16 bit: give the number that the camera used"),
+        (stripe_image().astype(np.uint16) * 16, {"bits": 10}, "exceeds 10 bits: .*'high'"),
+        (stripe_image().astype(np.uint16) * 3, {"bits": 10, "aligned": "high"}, "more than its upper 10 bits"),
+        (stripe_image(), {"bits": 10}, "a file of 8 bit, but bits = 10"),
+        (stripe_image(), {"channel": "red - green"}, "a.png has no colours"),
+        # Of the red stripe, only the black green channel.
+        (
+            np.dstack([0 * WHITE, 0 * WHITE, stripe_image()]),
+            {"channel": "green"},
+            "black.*the channel that of its colour",
+        ),
+    ],
+)
+def test_images_that_contradict_the_description_are_refused(tmp_path: Path, image, given: dict, words: str):
+    refused(folder_of(tmp_path, {"a.png": image}, GIVEN | given), tmp_path, ImageError, words)
 
 
 def test_all_black(tmp_path: Path):
@@ -495,27 +509,9 @@ def test_all_black(tmp_path: Path):
     refused(folder_of(tmp_path, images, given), tmp_path, ImageError, "all 2 lamp images are black")
 
 
-def test_the_wrong_channel_is_black(tmp_path: Path):
-    colour = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    colour[:, :, 2] = stripe_image()
-    folder = folder_of(tmp_path, {"l1.png": colour}, GIVEN | {"channel": "green"})
-    refused(folder, tmp_path, ImageError, "black.*the channel that of its colour")
-
-
 def test_one_black_image_is_reported(tmp_path: Path):
     imported = import_images(three(tmp_path, l2=np.zeros((HEIGHT, WIDTH), np.uint8)), tmp_path / "a.h5")
     assert imported.warnings[0] == "1 of 3 laser images are black, such as l2.png"
-
-
-def test_all_white(tmp_path: Path):
-    white = np.full((HEIGHT, WIDTH), 255, np.uint8)
-    white[: HEIGHT // 3] = 200
-    refused(three(tmp_path, l2=white), tmp_path, ImageError, "l2.png is white: 67 % of its pixels are saturated")
-
-
-def test_white_with_ten_bits(tmp_path: Path):
-    folder = folder_of(tmp_path, {"l1.png": np.full((HEIGHT, WIDTH), 1023, np.uint16)}, GIVEN | {"bits": 10})
-    refused(folder, tmp_path, ImageError, "is white: 100 % .*1023 DN")
 
 
 def test_without_stripe_is_reported_and_imported(tmp_path: Path):
@@ -533,28 +529,6 @@ def test_a_stripe_across_is_reported(tmp_path: Path):
     folder = folder_of(tmp_path, {"l1.png": np.pad(image, ((0, 0), (8, 8)), "reflect")}, GIVEN | {"sensor": sensor})
     warnings = import_images(folder, tmp_path / "a.h5").warnings
     assert "one runs across: the images are rotated, or the sensor's stripe_along" in warnings[0]
-
-
-def test_alpha(tmp_path: Path):
-    folder = three(tmp_path, l2=np.dstack([stripe_image()] * 4))
-    refused(folder, tmp_path, ImageError, "l2.png has 4 channels, including an alpha channel")
-
-
-def test_colour_without_a_channel(tmp_path: Path):
-    folder = three(tmp_path, l2=np.dstack([stripe_image(), lamp_image(), lamp_image()]))
-    refused(folder, tmp_path, ImageError, "l2.png is a colour image: choose the channel")
-
-
-def test_sixteen_bits_of_unknown_use(tmp_path: Path):
-    image = stripe_image().astype(np.uint16)
-    refused(folder_of(tmp_path, {"l.png": image}), tmp_path, ImageError, "16 bit: give the number that the camera used")
-    given = GIVEN | {"bits": 10}
-    refused(folder_of(tmp_path, {"l.png": image * 16}, given), tmp_path, ImageError, "exceeds 10 bits: .*'high'")
-    refused(
-        folder_of(tmp_path, {"l.png": stripe_image()}, given), tmp_path, ImageError, "a file of 8 bit, but bits = 10"
-    )
-    with pytest.raises(ImageError, match="more than its upper 10 bits"):
-        grey_values(image * 3, bits=10, aligned="high", name="l.png")
 
 
 def test_several_pages_and_floating_point(tmp_path: Path):

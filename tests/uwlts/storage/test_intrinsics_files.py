@@ -12,7 +12,7 @@ from uwlts.model.calibration import CameraModel
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Distortion
 from uwlts.optics.camera import directions, project
-from uwlts.storage.import_ import KnownCamera, read_intrinsics, set_intrinsics
+from uwlts.storage.import_.camera_files import KnownCamera, read_intrinsics, set_intrinsics
 
 MATRIX = np.array([[2451.25, 0.0, 640.5], [0.0, 2450.75, 511.25], [0.0, 0.0, 1.0]])
 COEFFICIENTS = np.array([-0.125, 0.0625, 1e-3, -2e-3, 0.03125])

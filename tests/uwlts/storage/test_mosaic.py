@@ -9,7 +9,7 @@ import pytest
 from tests.uwlts.storage.test_import import GIVEN, HEIGHT, WIDTH, folder_of, stripe_image
 from uwlts.errors import ImageError
 from uwlts.storage.capture import Capture
-from uwlts.storage.import_ import import_images
+from uwlts.storage.import_.folder import import_images
 from uwlts.storage.import_.grey_values import demosaic, is_mosaic
 
 PATTERNS = ("RGGB", "GRBG", "GBRG", "BGGR")

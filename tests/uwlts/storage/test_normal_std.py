@@ -8,9 +8,8 @@ import pytest
 import trimesh
 
 import uwlts
-from uwlts.storage.cloud import PointCloud, PointUncertainty
+from uwlts.storage.cloud import PointCloud, PointUncertainty, compute_normal_std
 from uwlts.storage.cloud_files import load_cloud, read_cloud, write_cloud
-from uwlts.storage.normal_std import compute_normal_std
 
 IMAGES, LINES = 12, 200
 AXES_MM = np.array([0.01, 0.02, 0.05])

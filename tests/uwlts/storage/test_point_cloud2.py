@@ -6,7 +6,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from uwlts.desk.scan import StampedClouds
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
-from uwlts.storage.point_cloud2 import bag_types
+from uwlts.storage.ros_messages import bag_types
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 NAME = "sensor_msgs/msg/PointCloud2"

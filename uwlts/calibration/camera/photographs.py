@@ -26,7 +26,9 @@ from uwlts.model.library import read_table
 from uwlts.model.short_text import Brief
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.image_file import read_image
-from uwlts.storage.import_ import DESCRIPTION_NAME, check_channel, extract_channel, image_files
+from uwlts.storage.import_.folder_description import NAME as DESCRIPTION_NAME
+from uwlts.storage.import_.grey_values import check_channel, extract_channel
+from uwlts.storage.import_.matching import image_files
 from uwlts.targets import Target, parse_target
 
 _FEWEST_IMAGES = 4  # three determine a lens, the fourth checks it

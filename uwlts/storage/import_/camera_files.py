@@ -1,6 +1,5 @@
 """Camera calibrations of other programs: OpenCV, Kalibr, ROS CameraInfo; equidistant lenses become rational ones."""
 
-import io
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -139,25 +138,20 @@ def _xml(text: str, path: Path) -> dict[str, object]:
     """Return the top-level entries of an OpenCV XML file; text becomes a list of words."""
     if "<!" in text.replace("<!--", ""):
         raise DescriptionError(f"{path} declares a type of document or entities, which no file of OpenCV does")
-    depth, root = 0, None
+
+    def value(element: ElementTree.Element, depth: int) -> object:
+        if depth > MOST_DEPTH:
+            raise DescriptionError(f"{path} nests its elements more than {MOST_DEPTH} deep")
+        if len(element) == 0:
+            words = [word.strip('"') for word in (element.text or "").split()]
+            return words[0] if len(words) == 1 else words
+        inside = [(child.tag, value(child, depth + 1)) for child in element]
+        return [each for _, each in inside] if all(tag == "_" for tag, _ in inside) else dict(inside)
+
     try:
-        for event, element in ElementTree.iterparse(io.BytesIO(text.encode()), ("start", "end")):
-            depth += 1 if event == "start" else -1
-            if depth > MOST_DEPTH:
-                raise DescriptionError(f"{path} nests its elements more than {MOST_DEPTH} deep")
-            root = element
+        return {child.tag: value(child, 2) for child in ElementTree.fromstring(text.encode())}
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise DescriptionError(f"{path} is no complete XML: {error}") from error
-    return {child.tag: _value(child) for child in root} if root is not None else {}
-
-
-def _value(element: ElementTree.Element) -> object:
-    if len(element) == 0:
-        words = [word.strip('"') for word in (element.text or "").split()]
-        return words[0] if len(words) == 1 else words
-    if all(child.tag == "_" for child in element):
-        return [_value(child) for child in element]
-    return {child.tag: _value(child) for child in element}
 
 
 def _yaml(text: str, path: Path) -> dict[str, object]:
@@ -263,13 +257,9 @@ def _unpack_kalibr(known: dict[str, object], path: Path) -> dict[str, object]:
     return camera
 
 
-def _first(known: dict[str, object], names: tuple[str, ...]) -> object:
-    return next((known[name] for name in names if known.get(name) is not None), None)
-
-
 def _numbers(known: dict[str, object], names: tuple[str, ...], path: Path) -> np.ndarray:
     """Return the finite numbers (N,) of a matrix in any of its notations."""
-    value = _first(known, names)
+    value = next((known[name] for name in names if known.get(name) is not None), None)
     value = value.get("data") if isinstance(value, dict) else value
     if value is None:
         raise DescriptionError(
@@ -301,7 +291,8 @@ def _distortion(coefficients: np.ndarray, path: Path) -> Distortion:
 
 
 def _size(known: dict[str, object], path: Path) -> tuple[int, int] | None:
-    size = _first(known, ("imagewidth", "width")), _first(known, ("imageheight", "height"))
+    sides = ((known.get(f"image{side}"), known.get(side)) for side in ("width", "height"))
+    size = [given if given is not None else other for given, other in sides]
     if None in size:
         return None
     try:
@@ -337,8 +328,6 @@ _BEYOND = 1.02
 """Fitted radius in the image, in radii of the corner: points just outside the image are projected as well."""
 _SAMPLES = 500
 """Angles of the fit: fifty for each of its numbers."""
-_PASSES = 20
-"""Passes of the weighted linear fit; the weights settle in less than ten."""
 _LARGEST_MISS_PX = 0.02
 """Largest difference of both models in the image, less than half the error of a good corner. For f = 436 px, lenses
 with k = 0 and with three sets of coefficients of real size differ by 0.003 px up to 70 deg. The difference is 0.02 px
@@ -373,7 +362,7 @@ def convert_equidistant(coefficients: np.ndarray, *, corner: float, focal_px: fl
     seen, r = _image_radius(coefficients, angle), np.tan(angle)
     powers = np.stack([r**2, r**4, r**6], axis=1)
     below, found = np.ones_like(r), np.zeros(6)
-    for _ in range(_PASSES):
+    for _ in range(20):  # passes; the weights settle in less than ten
         weight = r / below
         terms = np.hstack([powers, -powers * (seen / r)[:, None]]) * weight[:, None]
         scale = np.linalg.norm(terms, axis=0)
@@ -391,8 +380,7 @@ def convert_equidistant(coefficients: np.ndarray, *, corner: float, focal_px: fl
             f"{_LARGEST_MISS_PX} px are allowed, as up to about 70 deg: cut the images, or calibrate with "
             "rational_polynomial"
         )
-    names = ("k1", "k2", "k3", "k4", "k5", "k6")
-    return Distortion(**dict(zip(names, found.tolist(), strict=True)))
+    return Distortion(**{f"k{number}": value for number, value in enumerate(found.tolist(), 1)})
 
 
 def _image_radius(coefficients: np.ndarray, angle: np.ndarray) -> np.ndarray:

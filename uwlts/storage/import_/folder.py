@@ -1,7 +1,8 @@
 """Import of a folder of images as a capture, with checks for black, saturated and stripe-free images."""
 
 import math
-from dataclasses import dataclass, field, replace
+from collections import defaultdict
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -52,107 +53,95 @@ _INVERTED = 3.0  # largest dark deviation from the median of a laser image, rela
 _MANY_LINES = 0.5  # fraction of the profile lines with clipped pixels: the stripe itself rather than reflections
 
 
-@dataclass(eq=False)
 class _Content:
-    """Statistics of the images of one import.
+    """Names of the images of one import by what was found in them, and the warnings that follow.
 
-    ``saturation_dn`` is that of the files; ``target``: the description has a target. ``black`` has the names of the
-    dark images and ``seen`` the number of all, by whether the laser was on. ``with_stripe`` counts the images with a
-    stripe, ``sideways`` those with a stripe across the expected direction, ``clipped`` the laser images with clipped
-    pixels on most lines. ``mosaics`` has the names of the raw Bayer images among the first of each light,
-    ``repeats`` the laser images that are equal to the one before; ``inverted`` counts those with a dark stripe.
+    ``saturation_dn`` is that of the files; ``target``: the description has a target.
     """
 
-    stripe_along: str
-    saturation_dn: int
-    target: bool
-    black: dict[bool, list[str]] = field(default_factory=lambda: {False: [], True: []})
-    seen: dict[bool, int] = field(default_factory=lambda: {False: 0, True: 0})
-    with_stripe: int = 0
-    sideways: int = 0
-    clipped: int = 0
-    mosaics: list[str] = field(default_factory=list)
-    repeats: list[str] = field(default_factory=list)
-    inverted: int = 0
-    _last: np.ndarray | None = None
+    def __init__(self, stripe_along: str, saturation_dn: int, *, target: bool):
+        self._stripe_along, self._saturation_dn, self._target = stripe_along, saturation_dn, target
+        self._found: dict[str, list[str]] = defaultdict(list)
+        self._last: np.ndarray | None = None
 
-    def add_image(self, image: np.ndarray, clipped: np.ndarray, *, laser_on: bool, name: str) -> None:
-        """Count an image (H, W) and its ``clipped`` pixels (H, W); raises ImageError if most of it is saturated."""
-        self.seen[laser_on] += 1
+    def add_image(self, image: np.ndarray, clipped: np.ndarray, *, light: str, name: str) -> None:
+        """Note an image (H, W) and its ``clipped`` pixels (H, W); raises ImageError if most of it is saturated."""
+        self._found[light].append(name)
         white = float(clipped.mean())
         if white > WHITE:
             raise ImageError(
-                f"{name} is white: {100 * white:.0f} % of its pixels are saturated ({self.saturation_dn} DN): shorten "
+                f"{name} is white: {100 * white:.0f} % of its pixels are saturated ({self._saturation_dn} DN): shorten "
                 "the exposure, or leave it out (ignore)"
             )
-        if is_black(image, self.saturation_dn):
-            self.black[laser_on].append(name)
+        if is_black(image, self._saturation_dn):
+            self._found[f"black {light}"].append(name)
             return
-        if self.seen[laser_on] - len(self.black[laser_on]) <= _MOST_EXAMINED and is_mosaic(image):
-            self.mosaics.append(name)
-        if laser_on:
+        examined = len(self._found[light]) - len(self._found[f"black {light}"]) <= _MOST_EXAMINED
+        found = {"mosaic": examined and is_mosaic(image)}
+        if light == "laser":
             low, middle, high = np.percentile(image, (0.1, 50, 99.9))
-            self.inverted += bool(middle - low > _INVERTED * (high - middle))
-            self.clipped += bool(clipped.any(axis=1 if self.stripe_along == "height" else 0).mean() > _MANY_LINES)
-            if self._last is not None and np.array_equal(image, self._last):
-                self.repeats.append(name)
+            lines = clipped.any(axis=1 if self._stripe_along == "height" else 0)
+            found |= {"inverted": middle - low > _INVERTED * (high - middle), "clipped": lines.mean() > _MANY_LINES}
+            found |= {"repeated": self._last is not None and np.array_equal(image, self._last)}
             self._last = image
+        for what, holds in found.items():
+            self._found[what] += [name] if holds else []
 
-    def find_stripe(self, image: np.ndarray, saturation_dn: int) -> None:
+    def find_stripe(self, image: np.ndarray, name: str, *, saturation_dn: int) -> None:
         """Look for a stripe in a laser image (H, W) as it is stored."""
-        direction = find_stripe_direction(image, stripe_along=self.stripe_along, saturation=saturation_dn)
-        self.with_stripe += direction == "along"
-        self.sideways += direction == "across"
+        direction = find_stripe_direction(image, stripe_along=self._stripe_along, saturation=saturation_dn)
+        self._found[direction or "none"].append(name)
 
-    def add_line(self, stripe: Stripe) -> None:
-        """Count a centre line."""
-        self.seen[True] += 1
-        self.with_stripe += len(stripe.lines) >= FEWEST_LINES
+    def add_line(self, stripe: Stripe, name: str) -> None:
+        """Note a centre line."""
+        self._found["laser"].append(name)
+        self._found["along" if len(stripe.lines) >= FEWEST_LINES else "none"].append(name)
 
     def refuse_black(self) -> None:
         """Raise ImageError if all laser images are black, or all lamp images although there is a target."""
-        for laser_on, light, colour in ((True, "laser", " the channel that of its colour,"), (False, "lamp", "")):
-            seen = self.seen[laser_on] if laser_on or self.target else 0
-            if seen and len(self.black[laser_on]) == seen:
+        lights = {"laser": " the channel that of its colour,"} | ({"lamp": ""} if self._target else {})
+        for light, colour in lights.items():
+            seen = len(self._found[light])
+            if seen and len(self._found[f"black {light}"]) == seen:
                 raise ImageError(
                     f"all {seen} {light} images are black, no pixel reaches {100 * BLACK:g} % of full scale: is "
                     f"the {light} on, the exposure long enough,{colour} bits right?"
                 )
 
     def warnings(self) -> list[str]:
-        """Return the warnings after all images were counted."""
+        """Return the warnings after all images were noted."""
+        found, lasers = self._found, len(self._found["laser"])
         warnings = [
-            f"{len(self.black[on])} of {self.seen[on]} {light} images are black, such as {self.black[on][0]}"
-            for on, light in ((True, "laser"), (False, "lamp"))
-            if self.black[on]
+            f"{len(black)} of {len(found[light])} {light} images are black, such as {black[0]}"
+            for light in ("laser", "lamp")
+            if (black := found[f"black {light}"])
         ]
-        if self.mosaics:
+        if found["mosaic"]:
             warnings.append(
-                f"{self.mosaics[0]} looks like a raw Bayer image of a colour camera, whose pixels alternate between "
+                f"{found['mosaic'][0]} looks like a raw Bayer image of a colour camera, whose pixels alternate between "
                 "colours. This shifts the stripe: give the pattern and the laser's channel, such as bayer = 'RGGB' and "
                 "channel = 'red', or convert the images to grey or colour in the camera"
             )
-        if self.repeats:
+        if repeated := found["repeated"]:
             warnings.append(
-                f"{len(self.repeats)} of {self.seen[True]} laser images are equal to the one before, such as "
-                f"{self.repeats[0]}: the camera or a copy repeated an image, so that positions may be wrong"
+                f"{len(repeated)} of {lasers} laser images are equal to the one before, such as {repeated[0]}: the "
+                "camera or a copy repeated an image, so that positions may be wrong"
             )
-        lasers = self.seen[True]
-        if 2 * self.inverted > lasers and not self.target:
+        if 2 * len(found["inverted"]) > lasers and not self._target:
             warnings.append("the laser images have dark features on a bright ground: are their grey values inverted?")
-        if self.clipped:
+        if found["clipped"]:
             warnings.append(
-                f"{self.clipped} of {lasers} laser images are saturated on more than {100 * _MANY_LINES:g} % of their "
-                "profile lines, where the stripe is less accurate: shorten the exposure"
+                f"{len(found['clipped'])} of {lasers} laser images are saturated on more than {100 * _MANY_LINES:g} % "
+                "of their profile lines, where the stripe is less accurate: shorten the exposure"
             )
-        if lasers and not self.with_stripe:
+        if lasers and not found["along"]:
             advice = "check which images are laser images, the channel, and the exposure"
-            if self.sideways:
-                advice = f"in {self.sideways} of them one runs across: the images are rotated, or the sensor's "
-                advice += f"stripe_along ('{self.stripe_along}') is wrong"
+            if sideways := len(found["across"]):
+                advice = f"in {sideways} of them one runs across: the images are rotated, or the sensor's "
+                advice += f"stripe_along ('{self._stripe_along}') is wrong"
             warnings.append(f"no stripe in any of the {lasers} laser images: {advice}")
-        elif self.with_stripe < lasers:
-            warnings.append(f"{lasers - self.with_stripe} of {lasers} laser images show no stripe")
+        elif (missing := lasers - len(found["along"])) > 0:
+            warnings.append(f"{missing} of {lasers} laser images show no stripe")
         return warnings
 
 
@@ -259,7 +248,7 @@ def _import_folder(
     if images and saturation > np.iinfo(reader.dtype).max:
         raise DescriptionError(f"saturation_dn is {saturation}; images of {reader.dtype} have no such value")
     in_time = _in_order(frames)
-    content = _Content(header.sensor.camera.stripe_along, saturation, header.target is not None)
+    content = _Content(header.sensor.camera.stripe_along, saturation, target=header.target is not None)
     held = reader.dtype if images else np.dtype(np.uint8)
     dtype = np.dtype(np.uint16) if zero else held
     lines = given.centre_lines is not None
@@ -271,7 +260,7 @@ def _import_folder(
                 exposure_ms, time_s = np.nan_to_num([row.exposure_ms, row.time_s if in_time else 0.0]).tolist()
                 encoder = None
                 if row.profile is not None:
-                    content.add_line(row.profile)
+                    content.add_line(row.profile, row.file)
                     image, encoder = row.profile, None if math.isnan(row.encoder) else row.encoder
                 else:
                     image = _stored_image(row, reader, content, zero_dn=zero, saturation_dn=header.saturation_dn)
@@ -301,13 +290,14 @@ def _stored_image(
     laser_on = row.light == "laser"
     image, clipped, _ = reader.image(row.file, laser_on=laser_on)
     unsigned = np.maximum(image, 0).astype(reader.dtype, copy=False)
-    content.add_image(unsigned, clipped, laser_on=laser_on, name=Path(row.file).name)
+    name = Path(row.file).name
+    content.add_image(unsigned, clipped, light="laser" if laser_on else "lamp", name=name)
     if not laser_on:
         return unsigned
     if zero_dn:
         unlit = np.zeros_like(image) if row.background is None else reader.background(row.background)
         unsigned = subtract_background(image, unlit, clipped, zero_dn=zero_dn)
-    content.find_stripe(unsigned, saturation_dn)
+    content.find_stripe(unsigned, name, saturation_dn=saturation_dn)
     return unsigned
 
 

@@ -151,13 +151,6 @@ def subtract_background(image: np.ndarray, background: np.ndarray, clipped: np.n
 
 BayerPattern = Literal["RGGB", "GRBG", "GBRG", "BGGR"]
 """Colours of the first two rows and columns of a sensor."""
-
-_CODES = {
-    "RGGB": cv2.COLOR_BayerRGGB2BGR,
-    "GRBG": cv2.COLOR_BayerGRBG2BGR,
-    "GBRG": cv2.COLOR_BayerGBRG2BGR,
-    "BGGR": cv2.COLOR_BayerBGGR2BGR,
-}
 _SMOOTH, _ALTERNATING = np.array([1, 2, 1], np.float32) / 4, np.array([-1, 2, -1], np.float32) / 4
 _LIT = 0.3  # least brightness of the evaluated pixels, relative to the brightest
 _LEAST_SHARE = 0.1
@@ -174,7 +167,7 @@ def demosaic(image: np.ndarray, pattern: BayerPattern, *, name: str) -> np.ndarr
     """
     if image.ndim != 2:
         raise ImageError(f"{name} is a colour image, which has no Bayer pattern: leave bayer out")
-    return cv2.demosaicing(image, _CODES[pattern])
+    return cv2.demosaicing(image, getattr(cv2, f"COLOR_Bayer{pattern}2BGR"))
 
 
 def is_mosaic(image: np.ndarray) -> bool:

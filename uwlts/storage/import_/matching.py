@@ -108,9 +108,7 @@ def _row(number: int, cells: dict[str, str], place: str) -> ImageRow:
             f"{place}: the pose is not a rotation with a shift: its columns must be orthogonal unit vectors, given "
             f"with four decimals or more, its last row 0 0 0 1"
         )
-    stage_mm, exposure_ms, time_s, encoder = (numbers[name] for name in _NUMBERS)
-    known = stage_mm, exposure_ms, time_s, pose if given else None, encoder
-    return ImageRow(texts["file"], number, light, texts["background"] or None, *known)
+    return ImageRow(texts["file"], number, light, texts["background"] or None, pose=pose if given else None, **numbers)
 
 
 def _number(text: str, place: str) -> float:
@@ -164,7 +162,7 @@ def match(folder: Path, given: ImportDescription, rows: list[ImageRow] | None) -
         ignored = [row for row in known if row.light == "ignore"]
     else:
         ignored = [row for row in known if matches(row.file, given.ignore)]
-        used = [row for row in known if not matches(row.file, given.ignore)]
+        used = [row for row in known if row not in ignored]
         laser, lamp = ([row for row in used if matches(row.file, light)] for light in (given.laser, given.lamp))
         lit, under_lamp = {row.file for row in laser}, {row.file for row in lamp}
         _refuse_any(
@@ -178,15 +176,12 @@ def match(folder: Path, given: ImportDescription, rows: list[ImageRow] | None) -
             f"none of the {len(files)} images of {folder} is a laser or a lamp image: give patterns such as laser = "
             "'laser*.png' and lamp = 'lamp*.png', or a table with a column light"
         )
-    laser = _add_backgrounds(
-        folder,
-        [name for name in files if matches(name, given.background) and not matches(name, given.ignore)],
-        given,
-        laser,
-    )
-    described = {name for row in (*laser, *lamp, *ignored) for name in (row.file, row.background)}
+    unwanted = {name for name in files if matches(name, given.ignore)}
+    dark = [name for name in files if matches(name, given.background) and name not in unwanted]
+    laser = _add_backgrounds(folder, dark, given, laser)
+    described = {name for row in (*laser, *lamp, *ignored) for name in (row.file, row.background)} | unwanted
     described |= {given.table, given.centre_lines.table if given.centre_lines else None}
-    unmatched = [name for name in files if name not in described and not matches(name, given.ignore)]
+    unmatched = [name for name in files if name not in described]
     return Matched(laser, lamp, unmatched)
 
 
@@ -229,15 +224,16 @@ def planned_frames(given: ImportDescription, matched: Matched, *, in_table: bool
     Each has its position and its light, laser or lamp. Raises DescriptionError if positions are missing, given twice,
     or equal for two images of one light.
     """
-    positions, warnings = _positions(given, matched)
+    positions, warnings = _positions(given, {"laser": matched.laser, "lamp": matched.lamp})
     lamp_ms = given.exposure_ms if given.lamp_exposure_ms is None else given.lamp_exposure_ms
     frames = []
     for light, rows, usual_ms in (("lamp", matched.lamp, lamp_ms), ("laser", matched.laser, given.exposure_ms)):
         for place, row in enumerate(rows):
             stage_mm = row.stage_mm if positions is None else positions[light][place]
             if math.isnan(stage_mm):
-                advice = "fill in stage_mm in the table, or leave it out"
-                raise DescriptionError(f"the position of {row.file} is missing: {advice}")
+                raise DescriptionError(
+                    f"the position of {row.file} is missing: fill in stage_mm in the table, or leave it out"
+                )
             exposure_ms = usual_ms if usual_ms is not None and math.isnan(row.exposure_ms) else row.exposure_ms
             number = row.number if in_table else place
             frames.append(replace(row, light=light, number=number, stage_mm=stage_mm, exposure_ms=exposure_ms))
@@ -256,11 +252,12 @@ def stage_remark(given: ImportDescription) -> str:
     return "positions as listed"
 
 
-def _positions(given: ImportDescription, matched: Matched) -> tuple[dict[str, list[float]] | None, list[str]]:
+def _positions(
+    given: ImportDescription, lights: dict[str, list[ImageRow]]
+) -> tuple[dict[str, list[float]] | None, list[str]]:
     """Return the positions of the images of each light in their order, None if the table gives them; and warnings."""
     stage = given.stage
-    lights = {"laser": matched.laser, "lamp": matched.lamp}
-    in_column = any(math.isfinite(row.stage_mm) for row in (*matched.laser, *matched.lamp))
+    in_column = any(math.isfinite(row.stage_mm) for rows in lights.values() for row in rows)
     elsewhere = stage.free or stage.start_mm is not None or stage.positions_mm is not None
     if in_column and elsewhere:
         raise DescriptionError("the table has a column stage_mm, and [stage] gives positions too: give one of them")
