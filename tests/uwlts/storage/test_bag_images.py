@@ -11,7 +11,7 @@ from rosbags.typesys import Stores, get_typestore
 from tests.uwlts.storage.test_import import GIVEN, HEIGHT, SHAPE, WIDTH, lamp_image, stripe_image
 from uwlts.errors import DescriptionError, ImageError
 from uwlts.storage.capture import Capture
-from uwlts.storage.import_ import import_images
+from uwlts.storage.import_.folder import import_images
 
 TIMES_S = 1.7e9 + np.array([0.0, 0.1, 0.2, 0.45])
 STRIPES = [stripe_image(20.3 + 5 * n, seed=n) for n in range(4)]

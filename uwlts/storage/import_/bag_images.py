@@ -13,7 +13,7 @@ from uwlts.errors import ImageError
 from uwlts.storage.image_file import read_header
 from uwlts.storage.import_.folder_description import ImportDescription
 from uwlts.storage.import_.matching import matches
-from uwlts.storage.ros_bags import list_topics, open_bag, read_messages
+from uwlts.storage.ros_messages import list_topics, open_bag, read_messages
 
 _RAW, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _ENCODINGS = {"mono8": (1, 1), "8UC1": (1, 1), "mono16": (2, 1), "16UC1": (2, 1), "bgr8": (1, 3), "rgb8": (1, 3)}
