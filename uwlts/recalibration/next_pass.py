@@ -61,20 +61,21 @@ def _motions(start: np.ndarray, places: np.ndarray) -> Iterator[tuple[str, np.nd
     """Iterate over motions as text and their poses (4, 4), from the pose of the first pass."""
     axes, middle = start[:3, :3], places.mean(axis=0)
     width = float(np.ptp((places - middle) @ axes[:, 1]))
-    for part in _SHIFTS:
-        for sign in (1, -1):
-            far = sign * round(part * width, -1) or sign * 5.0
-            yield f"shift {far:+.0f} mm along Y", rigid_transform(np.eye(3), far * axes[:, 1]) @ start
-    for far in _LIFTS_MM:
-        yield f"move {far:.0f} mm farther away", rigid_transform(np.eye(3), -far * axes[:, 2]) @ start
-        yield f"move {far:.0f} mm closer", rigid_transform(np.eye(3), far * axes[:, 2]) @ start
+    shifts = [sign * round(part * width, -1) or sign * 5.0 for part in _SHIFTS for sign in (1, -1)]
+    lifts = [sign * far for far in _LIFTS_MM for sign in (1, -1)]
+    steps = [(f"shift {far:+.0f} mm along Y", far * axes[:, 1]) for far in shifts]
+    lifted = [(f"move {abs(far):.0f} mm {'closer' if far > 0 else 'farther away'}", far * axes[:, 2]) for far in lifts]
     turns = [(f"turn by {deg:.0f} deg about Z", deg * axes[:, 2]) for deg in _TURNS_DEG]
     turns += [
         (f"roll by {sign * deg:+.0f} deg about X", sign * deg * axes[:, 0]) for deg in _ROLLS_DEG for sign in (1, -1)
     ]
+    for words, vector in (*steps, *lifted):
+        yield words, rigid_transform(np.eye(3), vector) @ start
     for words, vector in turns:
         rotation = Rotation.from_rotvec(vector, degrees=True).as_matrix()
-        yield f"{words}, about the middle of the scene", rigid_transform(rotation, middle - rotation @ middle) @ start
+        for also, shift in (("", np.zeros(3)), *((f"{lift} and ", shift) for lift, shift in lifted)):
+            moved = rigid_transform(rotation, middle - rotation @ middle + shift)
+            yield f"{also}{words}, about the middle of the scene", moved @ start
 
 
 def _see(
