@@ -53,7 +53,7 @@ test test-full: style
 		echo "Tests that failed run once more, alone. Who passes only now depends on what runs beside it:"; \
 		$(PYTHON) -m pytest -v --last-failed --maxfail=4 $(PYTEST_OPTIONS); failed=$$?; \
 	fi; \
-	for name in $(AFTERWARDS); do $(BY_ITSELF) $$name || failed=$$?; done; exit $$failed
+	$(if $(AFTERWARDS),$(BY_ITSELF) --keep-going --jobs=2 --output-sync=target $(AFTERWARDS) || failed=$$?;) exit $$failed
 
 # Compiled loops are kept apart: both environments would replace those of the other.
 oldest: export NUMBA_CACHE_DIR := $(CURDIR)/$(OLDEST)/numba
