@@ -1,7 +1,6 @@
 """Files in PLY, text or binary: vertices with any numbers as properties, comments, and triangles."""
 
 import os
-import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -202,27 +201,24 @@ def _parse_bytes(
         (listed,) = (one for one in properties if one.length)
         if (rows[f"{listed.name} length"] == row[listed.name].shape[0]).all():
             return rows[[one.name for one in properties]], used
-    table, place, view = np.empty(count, kind), 0, content.data
-    sizes = {code: np.dtype(code).itemsize for code in _NAMES}
-    formats = {code: order + np.dtype(code).char for code in _NAMES}
-    try:
-        for number in range(count):
-            for one in properties:
-                code = one.length or one.kind
-                (value,) = struct.unpack_from(formats[code], view, place)
-                place += sizes[code]
-                if one.length is None:
-                    table[one.name][number] = value
-                elif not 0 <= value <= len(content):
+    table, place, content = np.empty(count, kind), 0, np.asarray(content)
+    kinds = {code: np.dtype(order + code) for code in _NAMES}
+
+    def read(code: str, number: int) -> np.ndarray:
+        nonlocal place
+        place += number * kinds[code].itemsize
+        if place > len(content):
+            raise _fault(path, "early end-of-file within an element with lists")
+        return content[place - number * kinds[code].itemsize : place].view(kinds[code])
+
+    for number in range(count):
+        for one in properties:
+            value = read(one.length or one.kind, 1)[0]
+            if one.length is not None:
+                if not 0 <= value <= len(content):
                     raise _fault(path, f"a list {one.name} has the length {value}")
-                else:
-                    end = place + int(value) * sizes[one.kind]
-                    table[one.name][number] = np.frombuffer(view[place:end], order + one.kind)
-                    place = end
-    except (struct.error, ValueError) as error:
-        raise _fault(path, "early end-of-file within an element with lists") from error
-    if place > len(content):
-        raise _fault(path, "early end-of-file within an element with lists")
+                value = read(one.kind, int(value))
+            table[one.name][number] = value
     return table, place
 
 
