@@ -39,7 +39,6 @@ _NEAR_HALF_TURN = 3.0
 """Angles in rad reach pi, unless turns are small; the largest in deg is between 3 and pi by chance only."""
 _METRES = np.array([1e3] * 3 + [1.0] * 3)
 """Units of shifts in m and rotations in rad, in mm and rad."""
-_MOST_POSES = 1_000_000  # more than an hour at 200 poses a second
 _LATEST_S = 1e11  # Unix times in s reach it in the year 5138; larger numbers are in ms, us or ns
 
 
@@ -215,8 +214,6 @@ def _poses(table: NumberTable, pose_format: PoseFormat, unit: Unit | None) -> tu
                 "with the angles' unit, -deg or -rad"
             )
     rows = np.column_stack([columns[name] for name in names]) if columns else np.empty((0, 0))
-    if len(rows) > _MOST_POSES:
-        raise DescriptionError(f"{path} has {len(rows):,} poses; this program reads up to {_MOST_POSES:,}")
     wrong = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if len(wrong):
         raise DescriptionError(f"{path}: pose {wrong[0] + 1} has a number that is missing or not finite")
