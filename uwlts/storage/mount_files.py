@@ -106,7 +106,7 @@ def read_mount_evidence(
             raise DescriptionError(
                 "from profiles, the axis of a rotary table is found with a sphere on it, without a scale"
             )
-        require_table(matrices, axis=chosen.axis)
+        require_table(matrices)
     if chosen.time and (profile_times_s is None or pose_times_s is None):
         raise DescriptionError("a time offset needs the times of profiles and poses: give both a column time_s")
     if profile_times_s is not None and pose_times_s is not None and (chosen.time or len(matrices) != len(checked)):
@@ -147,10 +147,8 @@ def _refuse_metres(profiles: list[np.ndarray], poses: np.ndarray) -> None:
         )
 
 
-def require_table(poses: np.ndarray, *, axis: str) -> None:
-    """Raise DescriptionError if poses (P, 4, 4) are not rotations about a table's z axis, or the axis is unknown."""
-    if axis not in SENSOR_AXES:
-        raise DescriptionError(f"the axis is {axis!r}; expected one of {', '.join(SENSOR_AXES)} of the sensor's frame")
+def require_table(poses: np.ndarray) -> None:
+    """Raise DescriptionError if poses (P, 4, 4) are not rotations about a table's z axis."""
     turns = np.linalg.inv(poses[0]) @ poses
     if max(np.abs(turns[:, 2] - (0, 0, 1, 0)).max(), np.abs(turns[:, :2, 3]).max()) > _ON_AXIS:
         raise DescriptionError(

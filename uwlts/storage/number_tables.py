@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from io import BytesIO
 from itertools import takewhile
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 import pyarrow as pa
@@ -113,7 +113,7 @@ def choose_scale(stated: str, unit: Unit | None, path: Path, error: type[Error] 
 
     Raises ``error`` if both are given and differ.
     """
-    given = MM_PER_UNIT[check_unit(unit or "mm")]
+    given = MM_PER_UNIT[unit or "mm"]
     if unit is not None and stated and _LENGTHS[stated] != given:
         raise error(f"{path} states {stated}, but the unit {unit} was given: leave the unit out, or correct the file")
     return _LENGTHS[stated] if stated else given
@@ -129,13 +129,6 @@ def find_stated_unit(texts: Iterable[str]) -> tuple[str, list[str]]:
     said = [text for text in texts if _UNIT_IN_COMMENT.search(text.lower())]
     doubt = "a comment may state another unit than that of the coordinates"
     return "", [f"{doubt}: {shorten(said[0], 100)}"] if said else []
-
-
-def check_unit(unit: Unit) -> Unit:
-    """Return the unit; raises DescriptionError if it is neither mm nor m."""
-    if unit not in get_args(Unit):
-        raise DescriptionError(f"the unit is {unit!r}; expected mm or m")
-    return unit
 
 
 def _split_lines(

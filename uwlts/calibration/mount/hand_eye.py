@@ -87,7 +87,7 @@ def mount_by_board(
     middle = target.points_mm.mean(axis=0)
     rotations = Rotation.from_matrix([image.base_from_platform[:3, :3] for image in images])
     if axis is not None:
-        require_table(np.array([image.base_from_platform for image in images]), axis=axis)
+        require_table(np.array([image.base_from_platform for image in images]))
     elif missing := describe_missing_turns(rotations, least_rad=OPEN_RAD):
         raise CalibrationError(f"the poses do not determine the mount: {'; '.join(missing)}")
     problem = BoardEvidence(images, calibration.object_transform(), middle, axis is not None)
