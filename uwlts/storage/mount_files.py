@@ -88,16 +88,16 @@ def read_mount_evidence(
     ``options`` are the given ones of `MountOptions`. Times (N,) belong to arrays. Raises DescriptionError if profiles
     and poses do not match, or one of them is not valid.
     """
-    digests: dict[str, str] = {}
+    given = [Path(each) for each in (profiles, poses) if isinstance(each, str | Path)]
     names: list[str] | None = None
     chosen = validate_description(MountOptions, options, "what is given")
     if poses is None:
         raise DescriptionError("the poses are missing: give T_base_platform of every profile")
     if isinstance(profiles, str | Path):
-        names, profiles, times = read_profiles(profiles, unit=chosen.profile_unit, digests=digests)
+        names, profiles, times = read_profiles(profiles, unit=chosen.profile_unit)
         profile_times_s = times if profile_times_s is None else profile_times_s
     if isinstance(poses, str | Path):
-        poses, times = read_poses(poses, pose_format=chosen.pose_format, unit=chosen.pose_unit, digests=digests)
+        poses, times = read_poses(poses, pose_format=chosen.pose_format, unit=chosen.pose_unit)
         pose_times_s = times if pose_times_s is None else pose_times_s
     checked = [_checked_profile(profile, number) for number, profile in enumerate(profiles)]
     matrices = check_matrices(np.asarray(poses, dtype=np.float64), "poses")
@@ -127,7 +127,7 @@ def read_mount_evidence(
         names=names or [str(number + 1) for number in range(len(checked))],
         profile_times_s=profile_times_s,
         pose_times_s=pose_times_s,
-        digests=digests,
+        digests={file.name: hash_file(file) for each in given for file in _listed_files(each)},
     )
 
 
@@ -184,8 +184,15 @@ def _checked_times(
     return wanted, times
 
 
+def _listed_files(path: Path) -> list[Path]:
+    """Return the CSV files of a folder, in the order of the numbers in their names, or a file alone."""
+    if not path.is_dir():
+        return [path]
+    return sorted((each for each in path.iterdir() if each.suffix.lower() == ".csv"), key=lambda p: natural_key(p.name))
+
+
 def read_profiles(
-    path: str | Path, *, unit: Unit | None = None, digests: dict[str, str] | None = None
+    path: str | Path, *, unit: Unit | None = None
 ) -> tuple[list[str], list[np.ndarray], np.ndarray | None]:
     """Read names, profiles (N, 2) or (N, 3) in mm, and times of profiles (or None) from files.
 
@@ -194,28 +201,24 @@ def read_profiles(
     names are x and z. Empty or NaN cells are missing points. In a cloud of the program, the points of pose n are in
     frame n. Raises DescriptionError for anything else.
     """
-    path, digests = Path(path), {} if digests is None else digests
+    path = Path(path)
     if path.is_dir():
-        files = sorted(
-            (each for each in path.iterdir() if each.suffix.lower() == ".csv"), key=lambda p: natural_key(p.name)
-        )
-        if not files:
+        if not (files := _listed_files(path)):
             raise DescriptionError(f"{path} holds no CSV files: expected one for each pose")
         listed = [file.name for file in files]
         log_warnings(path, name_gaps(listed, count_names(listed)))
         names, profiles, times = [], [], []
         for file in files:
-            table = read_number_table(file, digests)
+            table = read_number_table(file)
             names.append(file.stem)
             profiles.append(_points_of(table, unit))
             times.append(float(next(iter(table.columns.get("time_s", ())), np.nan)))
     elif path.suffix.lower() in (".ply", ".h5") and is_cloud(path):
-        digests[path.name] = hash_file(path)
         cloud = read_cloud(path)
         frames = np.unique(cloud.frame)
         return [str(frame) for frame in frames], [cloud.points_mm[cloud.frame == frame] for frame in frames], None
     else:
-        table = read_number_table(path, digests)
+        table = read_number_table(path)
         columns = table.columns
         if "pose" not in columns:
             raise DescriptionError(f"{path} has no column 'pose', the pose to which each point belongs")

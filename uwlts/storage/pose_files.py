@@ -43,11 +43,7 @@ _LATEST_S = 1e11  # Unix times in s reach it in the year 5138; larger numbers ar
 
 
 def read_poses(
-    path: str | Path,
-    *,
-    pose_format: PoseFormat = "matrix",
-    unit: Unit | None = None,
-    digests: dict[str, str] | None = None,
+    path: str | Path, *, pose_format: PoseFormat = "matrix", unit: Unit | None = None
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Read ``T_base_platform`` (P, 4, 4) in mm, and times (P,) or None, from a CSV file with one pose per line.
 
@@ -67,8 +63,7 @@ def read_poses(
         Names or their units contradict the format or ``unit``, or the number of columns is wrong. Numbers are not
         finite, matrices not rigid, quaternions not of unit length, or angles in rad look like degrees.
     """
-    table = read_number_table(Path(path), digests, named=False)
-    return _poses(table, pose_format, unit)
+    return _poses(read_number_table(Path(path), named=False), pose_format, unit)
 
 
 def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", unit: Unit | None = None) -> Trajectory:
