@@ -93,7 +93,8 @@ def _fault(path: Path, what: str) -> CaptureError:
     return CaptureError(f"{path} is not a complete PLY file: {what}")
 
 
-def _read_header(path: Path, *, called: str) -> _Header:
+def _split_header(path: Path, *, called: str) -> tuple[bytes, int, int]:
+    """Return the header, its length with the line of its end, and the size of the file."""
     with open_regular(path, called=called) as file:
         start, size = file.read(_LONGEST_HEADER), os.fstat(file.fileno()).st_size
     text, end, rest = start.partition(b"end_header")
@@ -104,6 +105,11 @@ def _read_header(path: Path, *, called: str) -> _Header:
     newline = b"\n" if text.startswith(b"ply\n") else b"\r\n" if text.startswith(b"ply\r\n") else b"\r"
     if not rest.startswith(newline):
         raise _fault(path, "early end-of-file, or other characters after end_header")
+    return text, len(text) + len(end) + len(newline), size
+
+
+def _read_header(path: Path, *, called: str) -> _Header:
+    text, used, size = _split_header(path, called=called)
     order, elements, comments = "", {}, []
     count, properties = 0, []
     for line in text.translate(_IN_ASCII).decode("ascii").splitlines()[1:]:
@@ -126,7 +132,7 @@ def _read_header(path: Path, *, called: str) -> _Header:
     if not order:
         raise _fault(path, "its header names no format")
     _require_complete(elements, size, path, ascii_text=order == "ascii")
-    return _Header(order == "ascii", _ORDERS[order], elements, comments, len(text) + len(end) + len(newline))
+    return _Header(order == "ascii", _ORDERS[order], elements, comments, used)
 
 
 def _require_complete(
@@ -201,8 +207,14 @@ def _parse_bytes(
         (listed,) = (one for one in properties if one.length)
         if (rows[f"{listed.name} length"] == row[listed.name].shape[0]).all():
             return rows[[one.name for one in properties]], used
-    table, place, content = np.empty(count, kind), 0, np.asarray(content)
-    kinds = {code: np.dtype(order + code) for code in _NAMES}
+    return _parse_lists(np.asarray(content), properties, np.empty(count, kind), order, path)
+
+
+def _parse_lists(
+    content: np.ndarray, properties: Sequence[_Property], table: np.ndarray, order: str, path: Path
+) -> tuple[np.ndarray, int]:
+    """Fill the table of an element with lists of any lengths; return it and the number of bytes."""
+    kinds, place = {code: np.dtype(order + code) for code in _NAMES}, 0
 
     def read(code: str, number: int) -> np.ndarray:
         nonlocal place
@@ -211,7 +223,7 @@ def _parse_bytes(
             raise _fault(path, "early end-of-file within an element with lists")
         return content[place - number * kinds[code].itemsize : place].view(kinds[code])
 
-    for number in range(count):
+    for number in range(len(table)):
         for one in properties:
             value = read(one.length or one.kind, 1)[0]
             if one.length is not None:
