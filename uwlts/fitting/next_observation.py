@@ -110,10 +110,14 @@ def _select_main_parameters(functions: np.ndarray, direction: np.ndarray, std: n
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Candidate:
-    """Observation that may be made next, as text, and the information (P, P) that it adds to the parameters."""
+    """Observation that may be made next, as text, and the information (P, P) that it adds to the parameters.
+
+    ``pose`` (4, 4) is that of the object to observe, or of what carries the sensor.
+    """
 
     words: str = ""
     information: np.ndarray
+    pose: np.ndarray
 
 
 AnyCandidate = TypeVar("AnyCandidate", bound=Candidate)

@@ -1,7 +1,7 @@
 """Weakly determined directions of a mount, missing motions, and the best pose to add."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -24,13 +24,6 @@ _LEAST_RAD = np.radians(0.005)  # the same for a rotation: 0.02 mm at 220 mm
 _POINTS = 100  # points of a simulated profile; more points are redundant
 _UNKNOWN_MM = 100.0  # prior standard uncertainty of the mount's shift, so that undetermined directions can be compared
 _UNKNOWN_RAD = 0.5  # the same for its rotation
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _CandidatePose(Candidate):
-    """Candidate with ``T_base_platform`` (4, 4)."""
-
-    pose: np.ndarray
 
 
 def next_pose(
@@ -64,7 +57,7 @@ def next_pose(
 
 def _generate_candidates(
     problem: Problem, state: MountState, scatter: Scatter, sheet: np.ndarray, names: list[str]
-) -> Iterator[_CandidatePose]:
+) -> Iterator[Candidate]:
     """Generate rotations of the pose nearest to the middle of all, in both directions, for every candidate view."""
     rotations, positions = problem.motion(state.offset_s)
     every = Rotation.from_matrix(rotations)
@@ -91,7 +84,7 @@ def _generate_candidates(
                 f"turn the platform by {np.degrees(side * _TURN_RAD):+.0f} deg about its {'xyz'[axis]} axis from pose "
                 f"{names[nearest]}, with the {problem.shape.kind} {where}"
             )
-            yield _CandidatePose(words=words, information=added.information[0], pose=rigid_transform(turned, position))
+            yield Candidate(words=words, information=added.information[0], pose=rigid_transform(turned, position))
 
 
 def _views(problem: Problem, state: MountState, sheet: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, str]]:
