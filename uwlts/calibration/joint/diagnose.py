@@ -344,7 +344,7 @@ def compute_size_deviations(result: Estimate, evidence: Sequence[Evidence]) -> l
     found = []
     for piece, local, covariance in zip(evidence, result.local, result.local_covariances, strict=True):
         if isinstance(piece, SurfaceScanEvidence):
-            count = piece.surface.parameter_count()
+            count = piece.surface.parameter_count
             sizes = piece.surface.sizes(local[:count])
             variance = np.einsum("ci,ij,cj->c", sizes.by_local, covariance[:count, :count], sizes.by_local)
             off_std = np.sqrt(variance + np.where(np.isfinite(sizes.std_mm), sizes.std_mm, 0.0) ** 2)

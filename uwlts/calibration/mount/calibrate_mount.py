@@ -12,11 +12,12 @@ from uwlts.calibration.mount.captured_profiles import CapturedProfiles, mount_co
 from uwlts.calibration.mount.hand_eye import mount_by_board
 from uwlts.calibration.mount.next_pose import NextPose, next_pose, require_determined, weaknesses
 from uwlts.calibration.mount.profile_evidence import (
-    SHAPES,
     Motion,
     MountState,
+    PlaneShape,
     Problem,
     Scatter,
+    SphereShape,
     from_sheet,
     thin,
     to_sheet,
@@ -201,7 +202,7 @@ class _Calibration:
     def __init__(self, evidence: MountEvidence, captured: CapturedProfiles | None = None) -> None:
         self.evidence = evidence
         self.captured = captured
-        self.shape = SHAPES[evidence.options.artefact](evidence.options.radius_mm)
+        self.shape = PlaneShape() if evidence.options.artefact == "plane" else SphereShape(evidence.options.radius_mm)
         self.rng = np.random.default_rng(0)
         most = max(_MOST_POINTS // len(evidence.profiles), 5 * LEAST_POINTS)
         self.rows = [thin(np.flatnonzero(np.isfinite(each).all(axis=1)), most) for each in evidence.profiles]
@@ -303,7 +304,7 @@ class _Calibration:
         self._require_small(float(np.hypot(scatter.pose_mm, scatter.smooth_mm)), state, len(used.points))
         if self.shape.radius_mm is None:
             return
-        free = replace(used, shape=type(self.shape)())
+        free = replace(used, shape=SphereShape())
         other = RestrictedEstimate(free, state, estimate.scatter)
         at = free.size - free.scale - free.time - 1
         step, std = float(other.propagate(other.residuals[:, :, None])[at, 0]), float(np.sqrt(other.covariance[at, at]))
@@ -358,7 +359,7 @@ class _Calibration:
                 )
             )
         std, at = np.sqrt(np.diag(covariance)), 6 + self.shape.count
-        found = self.shape.to_stored(state.artefact, float(std[at - 1]) if self.shape.radius_unknown else None)
+        found = self.shape.to_stored(state.artefact, float(std[at - 1]) if self.shape.count == 4 else None)
         transform = rigid_transform(Rotation.from_matrix(state.rotation).as_matrix(), state.translation)
         weights = used.counts / used.counts.sum()
         return Mount(

@@ -4,7 +4,6 @@ Each artefact is one class. Its start values are in `start_values`, its stored f
 of an artefact form an array; its parameters are steps from these values.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -17,89 +16,59 @@ from uwlts.calibration.mount.restricted_likelihood import GroupedEvidence, solve
 from uwlts.fitting.propagation import differences
 from uwlts.model.mount import PlaneFound, SphereFound
 from uwlts.optics.window import tilt_direction
-from uwlts.shapes.flat import perpendicular_to
+from uwlts.shapes.flat import perpendicular_to, unit_vectors
 from uwlts.shapes.profile_curves import LEAST_POINTS, Detection, find_arc, find_line
 from uwlts.storage.mount_files import Artefact
 
 
 @dataclass(frozen=True)
-class Shape(ABC):
-    """Kind of artefact; points (N, 3) are in the base frame."""
+class SphereShape:
+    """Sphere, in the base frame. Values: centre and radius (4,), mm; an unknown radius is the last parameter."""
 
     radius_mm: float | None = None
-    """Radius of a sphere, if known."""
 
-    kind: ClassVar[Artefact]
-    fewest_poses: ClassVar[int]
+    kind: ClassVar[Artefact] = "sphere"
+    fewest_poses: ClassVar[int] = 5
     """Number of poses that makes the problem overdetermined, with two or three equations per pose."""
-    flat: ClassVar[bool] = True
+    flat: ClassVar[bool] = False
     """True if profiles contain nearly straight lines, which determine the rotation of a pose."""
 
     @property
-    def radius_unknown(self) -> bool:
-        return not self.flat and self.radius_mm is None
-
-    @property
     def count(self) -> int:
-        """Number of parameters; an unknown radius is the last one."""
-        return 3 + self.radius_unknown
+        """Number of parameters."""
+        return 3 + (self.radius_mm is None)
 
-    @abstractmethod
     def find(self, points: np.ndarray, rng: np.random.Generator) -> Detection | None:
         """Find the artefact in a profile (N, 2), or return None."""
-
-    @abstractmethod
-    def apply_step(self, values: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """Return the values after a step (count,)."""
-
-    @abstractmethod
-    def distances(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Return signed distances (N,)."""
-
-    @abstractmethod
-    def normals(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Return derivatives (N, 3) of the distances by the points."""
-
-    @abstractmethod
-    def derivatives(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Return derivatives (N, count) of the distances by the parameters."""
-
-    @abstractmethod
-    def to_stored(self, values: np.ndarray, radius_std_mm: float | None) -> SphereFound | PlaneFound:
-        """Return the stored form of the artefact."""
-
-
-class SphereShape(Shape):
-    """Values: centre and radius (4,)."""
-
-    kind, fewest_poses, flat = "sphere", 5, False
-
-    def find(self, points: np.ndarray, rng: np.random.Generator) -> Detection | None:
         return find_arc(points, self.radius_mm, rng)
 
     def apply_step(self, values: np.ndarray, step: np.ndarray) -> np.ndarray:
-        return np.append(values[:3] + step[:3], values[3] + (step[3] if self.radius_unknown else 0.0))
+        """Return the values after a step (count,)."""
+        return values + np.pad(step, (0, 4 - self.count))
 
     def distances(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return signed distances (N,) of points (N, 3)."""
         return np.linalg.norm(points - values[:3], axis=1) - values[3]
 
     def normals(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
-        away = points - values[:3]
-        return away / np.linalg.norm(away, axis=1, keepdims=True)
+        """Return derivatives (N, 3) of the distances by the points."""
+        return unit_vectors(points - values[:3])
 
     def derivatives(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
-        by_radius = np.full((len(points), int(self.radius_unknown)), -1.0)
-        return np.hstack([-self.normals(values, points), by_radius])
+        """Return derivatives (N, count) of the distances by the parameters."""
+        return np.hstack([-self.normals(values, points), np.full((len(points), self.count - 3), -1.0)])
 
     def to_stored(self, values: np.ndarray, radius_std_mm: float | None) -> SphereFound:
+        """Return the stored form of the artefact."""
         x, y, z, radius = values.tolist()
         return SphereFound(centre_mm=(x, y, z), radius_mm=radius, radius_std_mm=radius_std_mm)
 
 
-class PlaneShape(Shape):
-    """Values: normal and distance (4,). Parameters: two rotations of the normal, and the distance."""
+class PlaneShape:
+    """Plane, like `SphereShape`. Values: normal and distance (4,). Parameters: two rotations, and the distance."""
 
-    kind, fewest_poses = "plane", 8
+    kind: ClassVar[Artefact] = "plane"
+    fewest_poses, flat, count, radius_mm = 8, True, 3, None
 
     def find(self, points: np.ndarray, rng: np.random.Generator) -> Detection | None:
         return find_line(points, rng)
@@ -121,7 +90,7 @@ class PlaneShape(Shape):
         return PlaneFound(normal=(x, y, z), distance_mm=distance)
 
 
-SHAPES: dict[Artefact, type[Shape]] = {each.kind: each for each in (SphereShape, PlaneShape)}
+Shape = SphereShape | PlaneShape
 
 
 Motion = Callable[[float], tuple[np.ndarray, np.ndarray]]
@@ -139,7 +108,7 @@ _LEAST_SHARE = 1e-3  # least factor on the noise of a plane's points, reached at
 
 @dataclass(frozen=True, eq=False)
 class MountState:
-    """Values of all unknowns: mount, artefact (see its `Shape`), scale and time offset."""
+    """Values of all unknowns: mount, artefact (see its shape), scale and time offset."""
 
     rotation: np.ndarray
     translation: np.ndarray

@@ -149,7 +149,7 @@ def test_known_sizes_are_off_by_their_standard_uncertainties():
     """Diameters of unknown uncertainty do not count, nor does anything of the same spheres of unknown size."""
     evidence, _ = evidence_of("spheres", artefact=STANDARD.model_copy(update={"spacing_uncertainty_mm": 0.02}))
     surface = evidence.surface
-    local = true_own("spheres", evidence)[: surface.parameter_count()]
+    local = true_own("spheres", evidence)[: surface.parameter_count]
     assert surface.sizes(local).residuals()[0] == pytest.approx([0.0], abs=1e-9)
     local[3:6] += 0.03 * (local[3:6] - local[:3]) / SPACING
     local[7] += 0.5
