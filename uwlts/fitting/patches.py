@@ -103,23 +103,9 @@ class Patches:
 
     def __getitem__(self, selection: Any) -> Patches:
         """Select patches by a slice, indices or a mask."""
-        return Patches(
-            self.places_mm[selection],
-            self.axes[selection],
-            self.shape[selection],
-            self.covariance[selection],
-            self.patterns_mm[:, selection],
-            self.numbers[selection],
-            self.radius_mm,
-            self.averages,
-            self.errors[selection],
-            self.image_variance_mm2[selection],
-            self.one_sided,
-            self.noise_stated,
-            self.shared,
-            self.overlap,
-            self.strips,
-        )
+        of_each = ("places_mm", "axes", "shape", "covariance", "numbers", "errors", "image_variance_mm2")
+        some = {name: getattr(self, name)[selection] for name in of_each}
+        return replace(self, patterns_mm=self.patterns_mm[:, selection], **some)
 
 
 def surface_patches(

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import assert_never
 
 import numpy as np
@@ -201,13 +202,17 @@ def check_consistency(result: Estimate, evidence: Sequence[Evidence], *, sensor:
 
 @dataclass(frozen=True)
 class Deviation:
-    """Deviation of a parameter: its value from evidence ``alone``, and ``known`` before with uncertainty ``std``."""
+    """Deviation of a parameter: its value from evidence ``alone``, and ``known`` before with uncertainty ``std``.
+
+    ``gain`` is the information gain, relative to ``std``.
+    """
 
     sigmas: float
     key: ParameterKey
     alone: float
     known: float
     std: float
+    gain: float
 
     def wrong(self) -> bool:
         """Return whether it is a contradiction, not only a doubt."""
@@ -219,36 +224,12 @@ class Deviation:
 
 
 def deviations(result: Estimate, *, least: float = _DOUBTFUL) -> list[Deviation]:
-    """Return parameters that deviate from prior knowledge by more than ``least`` standard uncertainties, sorted."""
-    far = [each for each, _ in _compare_with_priors(result) if each.sigmas > least]
-    return sorted(far, key=lambda each: each.sigmas, reverse=True)
-
-
-def estimate_birge_ratio(result: Estimate) -> float:
-    """Return the factor of too small prior uncertainties of sensor, media and stage, at least 1.
-
-    This is Birge's ratio, the RMS of deviations divided by standard uncertainties, if chance exceeds it less than once
-    in a thousand calibrations.
-    """
-    squares = np.array(
-        [
-            each.sigmas**2
-            for each, gain in _compare_with_priors(result)
-            if gain > _MUCH_GAINED and not isinstance(each.key, TargetParameter)
-        ]
-    )
-    if len(squares) < _FEWEST_GAINED or squares.sum() < chi2.isf(_FALSE_ALARM, len(squares)):
-        return 1.0
-    return float(np.sqrt(squares.mean()))
-
-
-def _compare_with_priors(result: Estimate) -> Iterator[tuple[Deviation, float]]:
-    """Compare parameters with prior knowledge; return deviation and relative information gain.
+    """Return parameters that deviate from prior knowledge by at least ``least`` standard uncertainties, sorted.
 
     The stripe's shift on the target is excluded: images have little information on it, so that small model errors
     dominate. The size of k1 and k2 is that of usual lenses, and nothing that a lens contradicts.
     """
-    parameters, covariance = result.parameters, result.covariance
+    parameters, covariance, found = result.parameters, result.covariance, []
     formal = covariance if result.formal_covariance is None else result.formal_covariance
     for key, value, known, std, after, exact in zip(
         parameters.keys,
@@ -264,20 +245,33 @@ def _compare_with_priors(result: Estimate) -> Iterator[tuple[Deviation, float]]:
             # exact: this is the variance of their difference if both are right (for none tied, 1 - after / std^2).
             gain = float(np.sqrt(max(1.0 + (after - 2 * exact) / std**2, _LEAST_GAIN**2)))
             alone = known + (value - known) / gain**2
-            yield Deviation(abs(value - known) / (gain * std), key, alone, known, std), gain
+            found.append(Deviation(abs(value - known) / (gain * std), key, alone, known, std, gain))
+    return sorted((each for each in found if each.sigmas >= least), key=lambda each: each.sigmas, reverse=True)
 
 
 @dataclass(frozen=True)
 class PriorDeviations:
-    """Deviations of ``every`` parameter from prior knowledge, the largest first, and Birge's ratio of them."""
+    """Deviations of ``every`` parameter of an estimate from prior knowledge, the largest first."""
 
     every: list[Deviation]
-    birge_ratio: float
 
     @classmethod
     def from_estimate(cls, result: Estimate) -> "PriorDeviations":
         """Compare an estimate with its prior knowledge."""
-        return cls(deviations(result, least=0.0), estimate_birge_ratio(result))
+        return cls(deviations(result, least=0.0))
+
+    @cached_property
+    def birge_ratio(self) -> float:
+        """Factor of too small prior uncertainties of sensor, media and stage, at least 1.
+
+        This is Birge's ratio, the RMS of deviations divided by standard uncertainties, if chance exceeds it less than
+        once in a thousand calibrations.
+        """
+        gained = [d for d in self.every if d.gain > _MUCH_GAINED and not isinstance(d.key, TargetParameter)]
+        squares = np.array([each.sigmas**2 for each in gained])
+        if len(squares) < _FEWEST_GAINED or squares.sum() < chi2.isf(_FALSE_ALARM, len(squares)):
+            return 1.0
+        return float(np.sqrt(squares.mean()))
 
     def of_target(self) -> list[Deviation]:
         """Return the deviations of the target's form and size."""
@@ -348,11 +342,9 @@ def compute_size_deviations(result: Estimate, evidence: Sequence[Evidence]) -> l
             sizes = piece.surface.sizes(local[:count])
             variance = np.einsum("ci,ij,cj->c", sizes.by_local, covariance[:count, :count], sizes.by_local)
             off_std = np.sqrt(variance + np.where(np.isfinite(sizes.std_mm), sizes.std_mm, 0.0) ** 2)
-            quantities = (ParameterLabel(name, "mm") for name in sizes.names)
             figures = np.column_stack([sizes.described_mm, sizes.std_mm, sizes.off_mm, off_std]).tolist()
-            found += [
-                SizeDeviation(piece.scan(), *each) for each in zip(quantities, *zip(*figures, strict=True), strict=True)
-            ]
+            named = zip(sizes.names, figures, strict=True)
+            found += [SizeDeviation(piece.scan(), ParameterLabel(name, "mm"), *each) for name, each in named]
     return found
 
 

@@ -10,7 +10,7 @@ from uwlts.calibration.joint.parameters import Parameters
 from uwlts.calibration.joint.residuals import STEP, STRIPE, TARGET, Residuals, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import SCANNED, SurfaceScanEvidence
 from uwlts.errors import CalibrationError
-from uwlts.fitting.least_squares import DEFAULT_K, MAD_TO_STD, robust_std
+from uwlts.fitting.least_squares import DEFAULT_K, robust_std
 from uwlts.fitting.schur_least_squares import LocalPrior, Observation, SchurFit, schur_least_squares
 from uwlts.model.parameter_keys import ParameterKey
 from uwlts.model.sensor import Uncertainty
@@ -237,8 +237,9 @@ def _estimate_all_noise(
             common_px, bodies = np.concatenate([e.common_px for e in scans]), sum(e.surface.count for e in scans)
             result[kind] = add_common_error(result[kind], common_px, bodies=bodies)
         if kind in misfits:
-            per_image = float(np.mean([len(r.values) for r in of_kind]))
-            result[kind] = add_misfit(result[kind], per_image=per_image)
+            # With an incomplete model, the residuals of an image count as one.
+            noise, per_image = result[kind], float(np.mean([len(r.values) for r in of_kind]))
+            result[kind] = replace(noise, besides=noise.besides + max(per_image - noise.together, 0.0))
     return result
 
 
@@ -250,15 +251,10 @@ def outliers(residuals: Residuals, noise: Noise) -> np.ndarray:
     return large
 
 
-def outlier_limit(values: np.ndarray) -> float:
-    """Return the absolute value beyond which values are outliers: five robust standard deviations."""
-    return DEFAULT_K * MAD_TO_STD * float(np.median(np.abs(values)))
-
-
 def estimate_noise(kind: str, residuals: Sequence[Residuals], points: Sequence[np.ndarray]) -> Noise:
     """Estimate the noise of all residuals of a kind; ``points`` (N, 3) of each placement are used for target points."""
     values = np.concatenate([r.values for r in residuals])
-    limit = outlier_limit(values)
+    limit = DEFAULT_K * robust_std(values)
     kept = np.abs(values) <= limit
     sigma = float(np.sqrt(np.mean(values[kept] ** 2))) if kept.any() else limit / DEFAULT_K
     if sigma < _FINEST_PX:
@@ -277,11 +273,6 @@ def add_common_error(noise: Noise, common_px: np.ndarray, *, bodies: float) -> N
     """Add a common error of all points of a scanned body, with standard uncertainties ``common_px`` (N,)."""
     points_per_body, common = len(common_px) / bodies, float(np.mean(common_px**2))
     return Noise(noise.sigma_px, noise.together, points_per_body * common / noise.sigma_px**2)
-
-
-def add_misfit(noise: Noise, *, per_image: float) -> Noise:
-    """Return the noise with an incomplete model: the ``per_image`` residuals of an image count as one."""
-    return replace(noise, besides=noise.besides + max(per_image - noise.together, 0.0))
 
 
 def _point_variance_factor(values: np.ndarray, places: np.ndarray, kept: np.ndarray, sigma: float) -> float:

@@ -115,14 +115,11 @@ def sample_sheet(known: StoredEstimate, at_mm: np.ndarray) -> SheetSamples:
 
     Raises CalibrationError if a point is outside the camera's view.
     """
-    pixels = project_sheet_points(known, at_mm)
-    found = None
-    if np.isfinite(pixels).all():
-        found = known.parameters.stripe_points(known.values, known.view, pixels, across=known.across())
+    pixels, across = project_sheet_points(known, at_mm), known.across()
+    found = known.triangulate(pixels[:, 1 - across], pixels[:, across]) if np.isfinite(pixels).all() else None
     if found is None:
         raise CalibrationError("the calibration's covered volume is outside the camera's view: calibrate again")
-    by = np.einsum("ji,njp->nip", known.calibration.object_transform()[:3, :3], found.by)
-    return SheetSamples(at_mm, by[:, :, 1:], by[:, :, 0])
+    return SheetSamples(at_mm, found[1][:, :, 1:], found[1][:, :, 0])
 
 
 def project_sheet_points(known: StoredEstimate, at_mm: np.ndarray) -> np.ndarray:

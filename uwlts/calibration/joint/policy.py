@@ -80,7 +80,10 @@ def solve_and_check(problem: JointProblem) -> tuple[Estimate, Findings]:
     lens, window and stage, and would be barely visible in residuals. They are reported if there is no other
     contradiction.
     """
-    free = [_free_sizes(piece) for piece in problem.evidence]
+    free = [
+        replace(piece, surface=piece.surface.free_sizes()) if isinstance(piece, SurfaceScanEvidence) else piece
+        for piece in problem.evidence
+    ]
     result, against = _solve_with_observed_uncertainties(replace(problem, evidence=free))
     sizes, alone = compute_size_deviations(result, problem.evidence), not against.all_against() or bool(problem.misfits)
     doubts = [each.words() for each in sizes if each.doubtful()]
@@ -96,10 +99,6 @@ def solve_and_check(problem: JointProblem) -> tuple[Estimate, Findings]:
     if alone:
         against = replace(against, contradictions=wrong + against.contradictions)
     return result, against
-
-
-def _free_sizes(piece: Evidence) -> Evidence:
-    return replace(piece, surface=piece.surface.free_sizes()) if isinstance(piece, SurfaceScanEvidence) else piece
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Problem of a joint calibration: all evidence with start values, and the parameters to estimate from it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -21,7 +21,7 @@ from uwlts.calibration.joint.residuals import TargetEvidence
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError
 from uwlts.model.calibration import WindowModel
-from uwlts.model.parameter_keys import LensParameter, ParameterKey, TargetParameter
+from uwlts.model.parameter_keys import LensParameter, TargetParameter
 from uwlts.model.sensor import Sensor
 
 _TRIAL_LINES = slice(None, None, 4)  # stripe pixels for the comparison of lenses: neighbours are correlated
@@ -85,16 +85,11 @@ class JointProblem:
         } | usual_distortion(camera)
         parameters = replace(known, intrinsics=intrinsics, priors=priors)
         start = dict(zip(known.keys, near.values, strict=True))
-        start |= {LensParameter.FX: start.get(LensParameter.F, start.get(LensParameter.FX))}
-        start |= {LensParameter.F: start[LensParameter.FX]}
-        start |= {LensParameter.FY: start.get(LensParameter.FY, start[LensParameter.F])}
+        focal = start.get(LensParameter.F, start.get(LensParameter.FX))
+        start |= {LensParameter.F: focal, LensParameter.FX: focal, LensParameter.FY: start.get(LensParameter.FY, focal)}
         evidence = [e.with_stripes(_TRIAL_LINES) if isinstance(e, TargetEvidence) else e for e in self.evidence]
-        return replace(self.with_parameters(parameters, start), evidence=evidence, local=near.local)
-
-    def with_parameters(self, parameters: Parameters, start: Mapping[ParameterKey, float]) -> Self:
-        """Return the problem with other parameters; those without a start value begin at zero."""
         values = np.array([start.get(key, 0.0) for key in parameters.keys])
-        return replace(self, parameters=parameters, global_values=values)
+        return replace(self, parameters=parameters, evidence=evidence, global_values=values, local=near.local)
 
 
 def joint_problem(gathered: Gathered, *, options: CalibrationOptions) -> JointProblem:

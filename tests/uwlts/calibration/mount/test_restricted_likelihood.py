@@ -28,7 +28,14 @@ def profiles_of(kind: str) -> tuple[Problem, MountState]:
     def motion(offset_s: float) -> tuple[np.ndarray, np.ndarray]:
         return campaign.poses[:, :3, :3], campaign.poses[:, :3, 3] + offset_s * np.array([3.0, 5.0, -2.0])
 
-    problem = Problem(points, motion, np.array([0.0, 1.0, 0.0]), PlaneShape() if kind == "plane" else SphereShape(), scale=True, time=True)
+    problem = Problem(
+        points,
+        motion,
+        np.array([0.0, 1.0, 0.0]),
+        PlaneShape() if kind == "plane" else SphereShape(),
+        scale=True,
+        time=True,
+    )
     return problem, MountState(MOUNT[:3, :3], MOUNT[:3, 3], artefact)
 
 
