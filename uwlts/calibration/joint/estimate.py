@@ -198,12 +198,9 @@ def _fit(
         parts = piece.residuals(parameters, global_values, local)
         if parts is None:
             return None
-        rows: list[Observation | LocalPrior] = []
-        for number, part in enumerate(parts):
-            used = slice(None) if left_out is None else ~left_out[group][number]
-            columns, scale = (part.values[:, None], part.by_global, part.by_local), noise[part.kind].effective_px()
-            values, by_global, by_local = (column[used] / scale for column in columns)
-            rows.append(Observation(values, by_global, by_local, part.local_columns))
+        used = [slice(None)] * len(parts) if left_out is None else [~mask for mask in left_out[group]]
+        pairs = zip(parts, used, strict=True)
+        rows = [part.weighted(noise[part.kind].effective_px(), kept) for part, kept in pairs]
         known = piece.known_before(local, uncertainty)
         return [*rows, known] if len(known.residuals) else rows
 

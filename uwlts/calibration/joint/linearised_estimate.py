@@ -14,7 +14,7 @@ from uwlts.calibration.joint.estimate import Estimate, Evidence, Noise, outliers
 from uwlts.calibration.joint.residuals import TARGET, Residuals, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
 from uwlts.errors import CalibrationError
-from uwlts.fitting.schur_least_squares import invert_block
+from uwlts.fitting.schur_least_squares import invert_block, normal_equations
 from uwlts.model.parameter_keys import ParameterKey
 from uwlts.model.sensor import Uncertainty
 
@@ -26,26 +26,6 @@ _FEWEST_IMAGES = 4  # images of a target in two halves: two in each
 
 ImageId = tuple[int, int]
 """Number of the piece of evidence, and of the image in it."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """Residuals (n,) of one image without outliers, in px, their scale (n,) and derivatives (n, P) and (n, c).
-
-    The derivatives by local parameters are those by ``local_columns`` (c,); all others are zero.
-    """
-
-    values: np.ndarray
-    scale: np.ndarray
-    kind: np.ndarray
-    by_global: np.ndarray
-    by_local: np.ndarray
-    local_columns: np.ndarray
-
-    def normal(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the normal matrix (P + c, P + c) and gradient (P + c,)."""
-        design = np.hstack([self.by_global, self.by_local]) / self.scale[:, None]
-        return design.T @ design, design.T @ (self.values / self.scale)
 
 
 HeldOut = Sequence[tuple[np.ndarray, np.ndarray]]
@@ -93,25 +73,19 @@ class LinearisedEstimate:
     """Normal equations of an estimate, for each image of targets and steps; scans belong to all subsets."""
 
     def __init__(self, result: Estimate, evidence: Sequence[Evidence], uncertainty: Uncertainty):
-        self._result, self._count = result, len(result.values)
-        self._rows: dict[ImageId, _Rows] = {}
-        self._local_prior: list[tuple[np.ndarray, np.ndarray]] = []
-        self._images: list[list[ImageId]] = []
-        self._shared: set[int] = set()
-        for number, (piece, local, parts) in enumerate(zip(evidence, result.local, result.residuals, strict=True)):
-            known = piece.known_before(local, uncertainty)
-            by_local = known.by_local
-            self._local_prior.append(((by_local.T @ by_local).toarray(), by_local.T @ known.residuals[:, 0]))
-            if isinstance(piece, SurfaceScanEvidence):
-                self._shared.add(number)
-            of_image: dict[int, list[Residuals]] = {}
+        self._result, self._count, self._halves = result, len(result.values), split_in_halves(evidence)
+        self._prior_of = [
+            normal_equations([piece.known_before(local, uncertainty)], self._count, len(local))[0]
+            for piece, local in zip(evidence, result.local, strict=True)
+        ]
+        self._parts: dict[ImageId, list[tuple[Residuals, np.ndarray]]] = {}
+        for number, parts in enumerate(result.residuals):
             for part in parts:
-                of_image.setdefault(part.image, []).append(part)
-            self._images.append([(number, image) for image in of_image])
-            self._rows |= {(number, image): self._gather_rows(some) for image, some in of_image.items()}
-        self._normal = {image: rows.normal() for image, rows in self._rows.items()}
-        self._targets = [image for image in self._rows if isinstance(evidence[image[0]], TargetEvidence)]
-        self._halves = split_in_halves(evidence)
+                used = ~outliers(part, result.noise[part.kind])
+                self._parts.setdefault((number, part.image), []).append((part, used))
+        self._normal = {image: self._sum_products(image) for image in self._parts}
+        self._targets = [image for image in self._parts if isinstance(evidence[image[0]], TargetEvidence)]
+        self._shared = [image for image in self._parts if isinstance(evidence[image[0]], SurfaceScanEvidence)]
         std = result.parameters.prior_std()
         self._prior = np.diag(np.where(np.isfinite(std), 1.0 / np.square(np.where(std > 0, std, 1.0)), 0.0))
         self._prior_gradient = self._prior @ (result.values - result.parameters.prior_mean())
@@ -120,17 +94,10 @@ class LinearisedEstimate:
             self._prior = self._prior + by_global.T @ by_global
             self._prior_gradient = self._prior_gradient + by_global.T @ off
 
-    def _gather_rows(self, parts: Sequence[Residuals]) -> _Rows:
-        columns: list[tuple[np.ndarray, ...]] = []
-        places = np.unique(np.concatenate([part.local_columns for part in parts]))
-        for part in parts:
-            noise = self._result.noise[part.kind]
-            used = ~outliers(part, noise)
-            by_local = np.zeros((len(part.values), len(places)))
-            by_local[:, np.searchsorted(places, part.local_columns)] = part.by_local
-            scale, kind = np.full(used.sum(), noise.effective_px()), np.full(used.sum(), part.kind)
-            columns.append((part.values[used], scale, kind, part.by_global[used], by_local[used]))
-        return _Rows(*(np.concatenate(column) for column in zip(*columns, strict=True)), local_columns=places)
+    def _sum_products(self, image: ImageId) -> np.ndarray:
+        noise, size = self._result.noise, len(self._prior_of[image[0]]) - self._count - 1
+        rows = [part.weighted(noise[part.kind].effective_px(), used) for part, used in self._parts[image]]
+        return normal_equations(rows, self._count, size)[0]
 
     def _reduce(self, chosen: Collection[ImageId]) -> tuple[np.ndarray, np.ndarray, dict[int, tuple[np.ndarray, ...]]]:
         """Return the normal equations (P, P) and (P,) of chosen images without prior knowledge of global parameters.
@@ -139,22 +106,16 @@ class LinearisedEstimate:
         """
         p = self._count
         total, gradient, backwards = np.zeros((p, p)), np.zeros(p), {}
-        for number, (prior, prior_gradient) in enumerate(self._local_prior):
-            own = [image for image in self._images[number] if image in chosen]
-            if not own:
-                continue
-            matrix, vector = np.zeros((p + len(prior),) * 2), np.zeros(p + len(prior))
-            for image in own:
-                at = np.append(np.arange(p), p + self._rows[image].local_columns)
-                matrix[np.ix_(at, at)] += self._normal[image][0]
-                vector[at] += self._normal[image][1]
-            block, border = matrix[p:, p:] + prior, matrix[:p, p:]
-            inverse = _invert(block)
+        sums: dict[int, np.ndarray] = {}
+        for number, image in sorted(chosen):
+            sums[number] = sums.get(number, self._prior_of[number]) + self._normal[number, image]
+        for number, product in sums.items():
+            border, own_gradient = product[:p, p:-1], product[p:-1, -1]
+            inverse = _invert(product[p:-1, p:-1])
             if inverse is None:
                 continue  # too few points of an image for its pose: it says nothing
-            own_gradient = vector[p:] + prior_gradient
-            total += matrix[:p, :p] - border @ inverse @ border.T
-            gradient += vector[:p] - border @ inverse @ own_gradient
+            total += product[:p, :p] - border @ inverse @ border.T
+            gradient += product[:p, -1] - border @ inverse @ own_gradient
             backwards[number] = (inverse, border, own_gradient)
         return total, gradient, backwards
 
@@ -173,21 +134,26 @@ class LinearisedEstimate:
             raise CalibrationError("too few images of a target to predict one from the others")
         for fold in range(folds):
             held = self._targets[fold::folds]
-            total, gradient, backwards = self._reduce(set(self._rows) - set(held))
+            total, gradient, backwards = self._reduce(set(self._parts) - set(held))
             inverse = _invert(total + self._prior)
             if inverse is None:
                 raise CalibrationError("without some of the images, the others do not determine the calibration")
             step = -inverse @ (gradient + self._prior_gradient)
             for image in held:
-                rows = self._rows[image]
-                moved = rows.values + rows.by_global @ step
+                columns: list[tuple[np.ndarray, ...]] = []
+                for part, used in self._parts[image]:
+                    by_local = np.zeros((len(used), len(self._result.local[image[0]])))
+                    by_local[:, part.local_columns] = part.by_local
+                    kind = np.full(len(used), part.kind)
+                    columns.append(tuple(c[used] for c in (part.values + part.by_global @ step, by_local, kind)))
+                moved, by_local, kind = (np.concatenate(column) for column in zip(*columns, strict=True))
                 if image[0] in backwards:
                     local_inverse, border, own_gradient = backwards[image[0]]
-                    local = -(local_inverse @ (own_gradient + border.T @ step))[rows.local_columns]
+                    local = -(local_inverse @ (own_gradient + border.T @ step))
                 else:
-                    points = rows.kind == TARGET
-                    local = -np.linalg.lstsq(rows.by_local[points], moved[points], rcond=None)[0]
-                found.append((moved + rows.by_local @ local, rows.kind))
+                    points = kind == TARGET
+                    local = -np.linalg.lstsq(by_local[points], moved[points], rcond=None)[0]
+                found.append((moved + by_local @ local, kind))
         return found
 
     def compare_halves(self) -> list[HalfDifference]:
@@ -197,7 +163,7 @@ class LinearisedEstimate:
         """
         if len(self._targets) < _FEWEST_IMAGES:
             return []
-        rest, rest_gradient, _ = self._reduce([image for image in self._rows if image[0] in self._shared])
+        rest, rest_gradient, _ = self._reduce(self._shared)
         rest, rest_gradient = rest + self._prior, rest_gradient + self._prior_gradient
         values, covariances = [], []
         for half in self._halves:
@@ -220,7 +186,7 @@ class LinearisedEstimate:
         """
         keys = self._result.parameters.keys
         held = np.array([key in tied for key in keys])
-        total = self._reduce(list(self._rows))[0] + self._prior
+        total = self._reduce(self._parts)[0] + self._prior
         inverse = _invert(total[np.ix_(~held, ~held)])
         if inverse is None:
             raise CalibrationError("the evidence does not determine the calibration")

@@ -23,6 +23,7 @@ from uwlts.calibration.joint.residuals import TARGET, StepProfileEvidence, Targe
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, ScannedSpheres, SurfaceScanEvidence
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, require_joint
 from uwlts.fitting.next_observation import Candidate, CovarianceRoot, Forecast, eliminate_others, rank_candidates
+from uwlts.fitting.schur_least_squares import normal_equations
 from uwlts.model.calibration import Calibration, rigid_transform
 from uwlts.model.parameter_keys import ParameterKey, StageParameter, StepHeight
 from uwlts.optics.triangulation import sheet_surface
@@ -288,13 +289,9 @@ def _compute_information(shot: _Simulated, known: int) -> np.ndarray | None:
     if isinstance(evidence, SurfaceScanEvidence):
         kind, surface = evidence.surface.kind, evidence.surface
         noise[kind] = add_common_error(noise[kind], evidence.common_px, bodies=surface.count)
-    count = len(estimate.values)
-    before = evidence.known_before(local_values, estimate.calibration.origin().known_before).by_local
-    total = np.zeros((count + len(local_values),) * 2)
-    total[known:count, known:count] = np.diag(estimate.parameters.prior_std()[known:] ** -2.0)
-    total[count:, count:] = (before.T @ before).toarray()
-    for part in parts:
-        rows = np.hstack([part.by_global, part.by_local]) / noise[part.kind].effective_px()
-        at = np.r_[0:count, count + part.local_columns]
-        total[np.ix_(at, at)] += rows.T @ rows
+    rows = [part.weighted(noise[part.kind].effective_px()) for part in parts]
+    before = evidence.known_before(local_values, estimate.calibration.origin().known_before)
+    total = normal_equations([*rows, before], len(estimate.values), len(local_values))[0][:-1, :-1]
+    added = np.arange(known, len(estimate.values))
+    total[added, added] += estimate.parameters.prior_std()[added] ** -2.0
     return eliminate_others(total, known)

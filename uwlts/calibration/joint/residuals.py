@@ -14,7 +14,7 @@ from uwlts.calibration.camera.camera_parameters import Placement
 from uwlts.calibration.camera.target_poses import centre_offsets
 from uwlts.calibration.joint.parameters import Parameters, SheetPoints, ViewMedium
 from uwlts.fitting.local_surface import group_rows
-from uwlts.fitting.schur_least_squares import LocalPrior
+from uwlts.fitting.schur_least_squares import LocalPrior, Observation
 from uwlts.model.calibration import rigid_transform
 from uwlts.model.parameter_keys import ParameterKey, StageParameter, StepHeight, TargetParameter
 from uwlts.model.sensor import Uncertainty
@@ -46,6 +46,11 @@ class Residuals:
     by_local: np.ndarray
     local_columns: np.ndarray
     image: int
+
+    def weighted(self, sigma_px: float, used: np.ndarray | slice = slice(None)) -> Observation:
+        """Return the ``used`` residuals in standard deviations, with their derivatives."""
+        columns = (self.values[:, None], self.by_global, self.by_local)
+        return Observation(*(column[used] / sigma_px for column in columns), self.local_columns)
 
 
 @dataclass(frozen=True, eq=False)
