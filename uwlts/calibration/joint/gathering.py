@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pydantic import JsonValue
 
-from uwlts.calibration.camera.camera_parameters import DISTORTION, CameraOptions, Placement, placements
+from uwlts.calibration.camera.camera_parameters import DISTORTION, CameraOptions
 from uwlts.calibration.camera.lens import LensChoice
 from uwlts.calibration.capture_evidence import (
     AirEvidence,
@@ -52,10 +52,6 @@ class Series:
     found: AirEvidence
     approaching: bool | None
     directions: Sequence[tuple[float, float, float]] = ()
-
-    def placements(self, *, free: bool) -> list[Placement]:
-        """Return placements: images joined by the stage's motion, or single images if ``free``."""
-        return placements(self.found.images, approaching=None if free else self.approaching)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,10 +103,6 @@ class Gathered:
     scans: list[ScanStripes]
     provenance: dict[str, JsonValue]
     warnings: list[str]
-
-    def views(self) -> list[ViewMedium]:
-        """Return window state and medium of each series of target images, each scan and each step image."""
-        return [s.view for s in [*self.series, *self.scans]] + [view for _, view in self.steps]
 
     def remove_images(self, sources: Collection[str]) -> "Gathered | None":
         """Remove images by name; return None if too few of a series, the steps or a scan would remain."""

@@ -9,7 +9,7 @@ from typing import assert_never
 import cv2
 import numpy as np
 
-from uwlts.calibration.camera.camera_parameters import DISTORTION, CameraOptions, Intrinsics, Placement
+from uwlts.calibration.camera.camera_parameters import DISTORTION, CameraOptions, Intrinsics, Placement, placements
 from uwlts.calibration.camera.target_poses import (
     CameraSolution,
     placement_pose,
@@ -169,7 +169,8 @@ def estimate_series_start(
     for part in series:
         seen_by = _Viewpoint(intrinsics.model(lens), window, indices, part.view)
         staged = not free and part.approaching is not None
-        for placement in part.placements(free=free):
+        # Images are joined by the stage's motion, unless poses are free.
+        for placement in placements(part.found.images, approaching=None if free else part.approaching):
             pose = seen_by.pose(placement)
             piece = _build_target_evidence(part, placement, seen_by, pose, sensor, staged=staged)
             start.evidence.append(piece)

@@ -94,7 +94,8 @@ class JointProblem:
 
 def joint_problem(gathered: Gathered, *, options: CalibrationOptions) -> JointProblem:
     """Build the problem from the captures, with start values; errors as `calibrate_jointly`."""
-    sensor, views = gathered.sensor, gathered.views()
+    sensor = gathered.sensor
+    views = [part.view for part in (*gathered.series, *gathered.scans)] + [view for _, view in gathered.steps]
     if not gathered.series:
         raise CalibrationError("no capture shows a target; joint calibration needs one in air or in water")
     bare = next((v.medium for v in views if v.medium is not None and not v.window and set(views) != {v}), None)

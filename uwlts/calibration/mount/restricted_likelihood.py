@@ -113,13 +113,14 @@ class RestrictedEstimate(Generic[State]):
         return self.evidence.jacobian(self.state)
 
     @cached_property
-    def _covariances(self) -> tuple[np.ndarray, np.ndarray]:
+    def covariances(self) -> tuple[np.ndarray, np.ndarray]:
+        """Covariances of the residuals (G, K, K) and their derivatives (Q, G, K, K) by the components."""
         return self.evidence.covariance(self.state)(np.log(self.scatter))
 
     @cached_property
     def _weighted(self) -> np.ndarray:
         """Inverse covariance times derivatives (G, K, size)."""
-        return np.linalg.solve(self._covariances[0], self.jacobian)
+        return np.linalg.solve(self.covariances[0], self.jacobian)
 
     @cached_property
     def information(self) -> np.ndarray:
@@ -155,7 +156,7 @@ class RestrictedEstimate(Generic[State]):
         freedom = max(sum(basis.shape[1] for basis in bases) - self.evidence.size, 1)
         for g, (basis, (step, covariance)) in enumerate(zip(bases, self.without_each, strict=True)):
             by = basis.T @ self.jacobian[g]
-            spread = by @ covariance @ by.T + basis.T @ self._covariances[0][g] @ basis
+            spread = by @ covariance @ by.T + basis.T @ self.covariances[0][g] @ basis
             off = basis.T @ self.residuals[g] + by @ step
             limit = len(off) * f.isf(probability, len(off), freedom)
             excess.append(float(off @ np.linalg.solve(spread, off) / limit))
@@ -168,8 +169,8 @@ class RestrictedEstimate(Generic[State]):
         of that variance (Giesbrecht and Burns, Biometrics 41, 1985). ``scales`` (R,) are the fractions of the variances
         that are estimated; the rest is known. The median over the rows is used.
         """
-        _, changes = self._covariances
-        inverses = np.linalg.inv(self._covariances[0])
+        _, changes = self.covariances
+        inverses = np.linalg.inv(self.covariances[0])
         flows = [np.swapaxes(self._weighted, 1, 2) @ change @ self._weighted for change in changes]
         summed = self.covariance @ np.sum(flows, axis=1)
         left = [inverses @ change for change in changes]
@@ -244,10 +245,8 @@ def _iterate(evidence: GroupedEvidence[State], state: State, scatter: np.ndarray
     fraction, before, size, criterion = 1.0, np.zeros(evidence.size), 0.0, np.inf
     sizes: list[float] = []
     for _ in range(_MOST_ROUNDS):
-        covariances, _ = evidence.covariance(state)(np.log(scatter))
-        step = solve_step(evidence, state, covariances)
-        by = evidence.jacobian(state)
-        information = np.einsum("gkp,gkq->pq", by, np.linalg.solve(covariances, by))
+        here = RestrictedEstimate(evidence, state, scatter)
+        step, information = solve_step(evidence, state, here.covariances[0]), here.information.sum(axis=0)
         size, last = (float(np.sqrt(each @ information @ each / evidence.size)) for each in (step, before))
         if step @ information @ before >= 0:
             fraction = min(2 * fraction, 1.0)
