@@ -136,19 +136,12 @@ def require_determined(covariance: np.ndarray, weak: Sequence[str], advised: Nex
 
 def weaknesses(covariance: np.ndarray, rotations: Rotation, *, table: bool) -> list[str]:
     """Describe weakly determined directions of a mount, and missing rotations of the platform."""
-    lines = []
+    lines, near = [], ": the artefact stays at nearly the same place in front of the sensor"
     limits = (
-        (_OPEN_MM, _LEAST_MM, "shift along", "mm", 1.0, ""),
-        (
-            OPEN_RAD,
-            _LEAST_RAD,
-            "turn about",
-            "deg",
-            np.degrees(1.0),
-            ": the artefact stays at nearly the same place in front of the sensor",
-        ),
+        (0, _OPEN_MM, _LEAST_MM, "shift along", "mm", 1.0, ""),
+        (3, OPEN_RAD, _LEAST_RAD, "turn about", "deg", np.degrees(1.0), near),
     )
-    for first, (limit, least, what, unit, size, why) in zip((0, 3), limits, strict=True):
+    for first, limit, least, what, unit, size, why in limits:
         variances, axes = np.linalg.eigh(covariance[first : first + 3, first : first + 3])
         stds = np.sqrt(np.maximum(variances, 0.0))
         for std, axis in zip(stds, axes.T, strict=True):

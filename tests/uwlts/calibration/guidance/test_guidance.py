@@ -261,7 +261,7 @@ def test_advised_poses_beat_as_many_random_ones(setting):
     wanted = CompletionLimits(focal_std_px=1e-6, centre_std_px=1e-6)
     count = 6
     wished = led(setting, wanted, np.random.default_rng(3), most=count)
-    options = candidates(solve_state([], setting, CompletionLimits()))
+    options = [*candidates(solve_state([], setting, CompletionLimits()))]
     assert len(options) > 20
     stds = []
     for draw in range(12):
@@ -294,7 +294,7 @@ def test_an_image_seen_again_gains_little(setting):
 
 def test_poses_that_are_skipped_give_way_to_the_next_best(setting):
     state = led(setting, CompletionLimits(), np.random.default_rng(3), most=1)
-    count = len(candidates(state))
+    count = len([*candidates(state)])
     first, second, last, again = (best_pose(state, skipped=skipped) for skipped in (0, 1, count - 1, count))
     assert first.gain >= second.gain >= last.gain and first.gain > last.gain
     assert len({wish.candidate.pose.tobytes() for wish in (first, second, last)}) == 3
