@@ -477,12 +477,9 @@ def _check_correlations(result: Estimate) -> Iterator[tuple[bool, str, str]]:
     """Find kinds with residuals correlated over many lines or points, as from a wrong lens or height."""
     for kind, noise in result.noise.items():
         if noise.together > _WAVES_DOUBTFUL:
-            where, values = ("across the image", "points") if kind == TARGET else ("along the stripe", "lines")
-            check = (
-                "the target's flatness, and the lens"
-                if kind == TARGET
-                else "heights, media and what else was described"
-            )
+            where, values, check = "along the stripe", "lines", "heights, media and what else was described"
+            if kind == TARGET:
+                where, values, check = "across the image", "points", "the target's flatness, and the lens"
             yield (
                 noise.together > _WAVES_WRONG,
                 kind,

@@ -292,10 +292,6 @@ class BoardEvidence(GroupedEvidence[_State]):
     def _sensor_from_target(self) -> np.ndarray:
         return np.linalg.inv(self.camera_from_sensor) @ np.array([image.camera_from_target for image in self.images])
 
-    @property
-    def groups(self) -> int:
-        return len(self.images)
-
     def select(self, kept: np.ndarray) -> Self:
         return replace(self, images=[self.images[k] for k in np.arange(len(self.images))[kept]])
 

@@ -165,10 +165,6 @@ class Problem(GroupedEvidence[MountState]):
     def values(self) -> int:
         return 6 + self.shape.count + self.scale + self.time
 
-    @property
-    def groups(self) -> int:
-        return len(self.points)
-
     def rms_mm(self, state: MountState) -> np.ndarray:
         """Return the root mean square distance (P,) of the points of each pose."""
         return np.sqrt(np.bincount(self.poses, self.distances(state) ** 2) / self.counts)

@@ -55,11 +55,6 @@ class GroupedEvidence(ABC, Generic[State]):
         """Number of parameters."""
         return self.free.shape[1]
 
-    @property
-    @abstractmethod
-    def groups(self) -> int:
-        """Number of groups."""
-
     @abstractmethod
     def select(self, kept: np.ndarray) -> Self:
         """Return the evidence of some groups, given as a mask or as their numbers."""
@@ -221,7 +216,7 @@ def settle_agreeing(
     The worst group is rejected as long as it contradicts the prediction of the others. ``require`` raises an error if a
     mask (G,) leaves too few groups.
     """
-    kept = np.ones(evidence.groups, dtype=bool)
+    kept = np.ones(len(evidence.residuals(starts[0][0])), dtype=bool)
     while True:
         require(kept)
         found = settle(evidence.select(kept), starts)

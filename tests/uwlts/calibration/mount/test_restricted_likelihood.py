@@ -130,10 +130,6 @@ class Readings:
 
     size = 1
 
-    @property
-    def groups(self):
-        return len(self.read)
-
     def select(self, kept):
         return replace(self, read=self.read[kept])
 
