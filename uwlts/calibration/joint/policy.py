@@ -22,15 +22,15 @@ from uwlts.calibration.joint.diagnose import (
 from uwlts.calibration.joint.estimate import Estimate, Evidence
 from uwlts.calibration.joint.gathering import Gathered
 from uwlts.calibration.joint.initial import find_odd_images
-from uwlts.calibration.joint.linearised_estimate import (
+from uwlts.calibration.joint.parameters import Parameters
+from uwlts.calibration.joint.problem import (
     HalfDifference,
+    JointProblem,
     compare_estimates,
-    keep_images,
+    joint_problem,
     mean_squares,
     split_in_halves,
 )
-from uwlts.calibration.joint.parameters import Parameters
-from uwlts.calibration.joint.problem import JointProblem, joint_problem
 from uwlts.calibration.joint.residuals import BENDS, STRETCH, STRIPE
 from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
@@ -204,9 +204,8 @@ def _compare_halves_of_form(problem: JointProblem, near: Estimate) -> list[HalfD
     """
     found = []
     for half in split_in_halves(problem.evidence):
-        evidence, local = keep_images(problem.evidence, near.local, half)
         with suppress(CalibrationError):
-            found.append(replace(problem, evidence=evidence, local=local, global_values=near.values).solve())
+            found.append(problem.with_images(half, near).solve())
     if len(found) < 2:
         return None
     std = problem.parameters.prior_std()

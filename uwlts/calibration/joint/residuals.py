@@ -244,6 +244,13 @@ class TargetEvidence(StripeEvidence):
         """Return the evidence with some of the stripe pixels only."""
         return replace(self, pixels=self.pixels[chosen], image=self.image[chosen], shifts_mm=self.shifts_mm[chosen])
 
+    def with_images(self, wanted: Sequence[int]) -> Self:
+        """Return the evidence of some images; stage positions still refer to the first image of all."""
+        here = np.isin(self.placement.image, wanted)
+        kept = {name: getattr(self.placement, name)[here] for name in ("points_mm", "shifts_mm", "pixels", "image")}
+        some = replace(self, placement=replace(self.placement, **kept))
+        return some.with_stripes(np.isin(self.image, wanted))
+
     def with_centres(
         self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray, diameter_mm: float
     ) -> Self:
