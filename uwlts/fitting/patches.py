@@ -128,8 +128,11 @@ def surface_patches(
     if len(points_mm) < 10 * _FEWEST:
         raise EvaluationError(f"the cloud has {len(points_mm)} points; at least {10 * _FEWEST} are needed")
     radius = radius_mm or find_disc_radius(points_mm)
-    owner, means, counts = _average_in_cubes(points_mm, radius / _CELLS_PER_RADIUS)
-    averages = Averages(means, counts, _average_patterns(uncertainty, owner, counts))
+    owner, first, counts = _divide_into_cubes(points_mm, radius / _CELLS_PER_RADIUS)
+    means = _average_in_cubes(points_mm, owner, counts)
+    patterns = [] if uncertainty is None else uncertainty.patterns_mm
+    shifts = np.array([_average_in_cubes(each, owner, counts) for each in patterns]).reshape(-1, len(counts), 3)
+    averages = Averages(means, counts, shifts)
     middle = _select_central(means, radius)
     discs = _gather_discs(averages, means[middle], radius)
     enough = discs.held.sum(axis=1) >= _FEWEST
@@ -140,7 +143,7 @@ def surface_patches(
     fit = _fit_discs(discs, axes, radius)
     variance = fit.point_variance
     kept = variance <= _ROUGH**2 * max(np.median(variance), 1e-30)
-    first, grouped = _first_points(owner), frame is not None and bool(np.any(frame >= 0))
+    grouped = frame is not None and bool(np.any(frame >= 0))
     variance = noise = np.maximum(variance, np.median(variance))
     if uncertainty is not None:
         known = uncertainty[first[middle]]
@@ -249,7 +252,8 @@ def find_disc_radius(points_mm: np.ndarray) -> float:
     if radius == 0:
         raise EvaluationError("most points have six others at the same place: omit repeated points")
     while radius < _LARGEST_PATCH * size:
-        means = _average_in_cubes(points_mm, radius / _CELLS_PER_RADIUS)[1]
+        owner, _, counts = _divide_into_cubes(points_mm, radius / _CELLS_PER_RADIUS)
+        means = _average_in_cubes(points_mm, owner, counts)
         away, near = _nearest_within(KDTree(means), means[:: max(1, len(means) // _SAMPLE)], radius)
         held = np.isfinite(away)
         near = np.where(held, near, 0)
@@ -419,12 +423,16 @@ def _columns(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
 
 
-def _average_in_cubes(points: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Average points in cubes; return the cube (N,) of each point, and means (C, 3) and counts (C,) of the cubes."""
+def _divide_into_cubes(points: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the cube (N,) of each point, and the first point (C,) and the number of points (C,) of each cube."""
     keys = number_cubes(points - points.min(axis=0), cell)
-    _, owner, counts = np.unique(keys, return_inverse=True, return_counts=True)
-    means = np.stack([np.bincount(owner, column) for column in points.T], axis=1) / counts[:, None]
-    return owner, means, counts.astype(np.float64)
+    _, first, owner, counts = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
+    return owner, first, counts.astype(np.float64)
+
+
+def _average_in_cubes(vectors: np.ndarray, owner: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Return the means (C, 3) of vectors (N, 3) in cubes."""
+    return np.stack([np.bincount(owner, column) for column in vectors.T], axis=1) / counts[:, None]
 
 
 def _select_central(points: np.ndarray, apart: float) -> np.ndarray:
@@ -467,13 +475,6 @@ def _level(places: np.ndarray, axes: np.ndarray, shape: np.ndarray) -> tuple[np.
     return moved, np.stack([first, np.cross(normal, first), normal], axis=1), level
 
 
-def _first_points(owner: np.ndarray) -> np.ndarray:
-    """Return the number of the first point in each cube, from the cubes (N,) of the points."""
-    first = np.zeros(int(owner.max()) + 1, np.int64)
-    first[owner[::-1]] = np.arange(len(owner))[::-1]
-    return first
-
-
 def _image_errors(
     known: PointUncertainty | None, frame: np.ndarray | None, owner: np.ndarray, first: np.ndarray
 ) -> tuple[csr_array, np.ndarray]:
@@ -484,14 +485,3 @@ def _image_errors(
     numbers = np.unique(frame, return_inverse=True)[1].ravel()
     shares = csr_array((1 / np.bincount(owner)[owner], (owner, numbers)))
     return shares, shifts[shifts.any(axis=(1, 2))].astype(np.float64)
-
-
-def _average_patterns(known: PointUncertainty | None, owner: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return the systematic patterns (M, C, 3) of averages."""
-    if known is None:
-        return np.zeros((0, len(counts), 3))
-    patterns = np.zeros((len(known.patterns_mm), len(counts), 3))
-    for number, pattern in enumerate(known.patterns_mm):
-        for axis, column in enumerate(pattern.T):
-            patterns[number, :, axis] = np.bincount(owner, column) / counts
-    return patterns
