@@ -164,21 +164,12 @@ class RestrictedEstimate(Generic[State]):
         of that variance (Giesbrecht and Burns, Biometrics 41, 1985). ``scales`` (R,) are the fractions of the variances
         that are estimated; the rest is known. The median over the rows is used.
         """
-        _, changes = self.covariances
-        inverses = np.linalg.inv(self.covariances[0])
-        flows = [np.swapaxes(self._weighted, 1, 2) @ change @ self._weighted for change in changes]
-        summed = self.covariance @ np.sum(flows, axis=1)
-        left = [inverses @ change for change in changes]
-        size = len(changes)
-        known = np.zeros((size, size))
-        for a in range(size):
-            for b in range(size):
-                twice = np.einsum("gkp,gkl,glm->pm", self.jacobian, left[a] @ left[b], self._weighted)
-                known[a, b] = 0.5 * (
-                    np.sum(left[a] * np.swapaxes(left[b], 1, 2))
-                    - 2 * np.sum(self.covariance * twice.T)
-                    + np.sum(summed[a] * summed[b].T)
-                )
+        covariances, changes = self.covariances
+        summed = self.covariance @ (np.swapaxes(self._weighted, 1, 2) @ changes @ self._weighted).sum(axis=1)
+        left = np.linalg.inv(covariances) @ changes
+        twice = np.einsum("gkp,agkl,bglm,gmq->abpq", self.jacobian, left, left, self._weighted, optimize=True)
+        known = 0.5 * (np.einsum("agkl,bglk->ab", left, left) + np.einsum("apq,bqp->ab", summed, summed))
+        known -= np.einsum("pq,abqp->ab", self.covariance, twice)
         known[0, 0] += 2 * self.evidence.pool_repeats(self.state)[0]
         free = np.diag(known) > 0
         variances = np.einsum("rp,pq,rq->r", rows, self.covariance, rows)
