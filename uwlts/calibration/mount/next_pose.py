@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, SphereShape, point_by_mount, to_sheet
+from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, SphereShape, to_sheet
 from uwlts.calibration.mount.restricted_likelihood import RestrictedEstimate
 from uwlts.errors import CalibrationError
 from uwlts.fitting.next_observation import Candidate, CovarianceRoot, rank_candidates
@@ -40,8 +40,9 @@ def next_pose(
     prior = np.zeros(problem.size)
     prior[:3], prior[3:6] = _UNKNOWN_MM**-2.0, _UNKNOWN_RAD**-2.0
     information = RestrictedEstimate(problem, state, np.array(scatter)).information.sum(axis=0)
-    to_point = np.zeros((3, problem.size))
-    to_point[:, :6] = point_by_mount(state.rotation @ np.vstack(problem.points).mean(axis=0))
+    # Derivatives of the middle point, along the platform's axes, by shift and rotation of the mount.
+    middle, to_point = state.rotation @ np.vstack(problem.points).mean(axis=0), np.eye(3, problem.size)
+    to_point[:, 3:6] = np.cross(middle, np.eye(3))
     known = CovarianceRoot.from_information(information + np.diag(prior))
     ranked = rank_candidates(known, to_point, _generate_candidates(problem, state, scatter, sheet, names))
     if not ranked:

@@ -293,14 +293,10 @@ class Problem(GroupedEvidence[MountState]):
     @cached_property
     def _bins(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """First point (B,) of each bin, its number of points, its pose, and its number in the profile."""
-        starts, poses, places = [], [], []
-        for pose, (count, end) in enumerate(zip(self.counts.tolist(), np.cumsum(self.counts).tolist(), strict=True)):
-            bins = min(_BINS, count)
-            starts.append(end - count + np.linspace(0, count, bins, endpoint=False).astype(int))
-            poses.append(np.full(bins, pose))
-            places.append(np.arange(bins))
-        first = np.concatenate(starts)
-        return first, np.diff(first, append=len(self._all)), np.concatenate(poses), np.concatenate(places)
+        bins = np.minimum(_BINS, self.counts)
+        poses, places = np.repeat(np.arange(len(bins)), bins), np.concatenate([np.arange(count) for count in bins])
+        first = (np.cumsum(self.counts) - self.counts)[poses] + (places * (self.counts / bins)[poses]).astype(int)
+        return first, np.diff(first, append=len(self._all)), poses, places
 
     def bin_means(self, values: np.ndarray) -> np.ndarray:
         """Return means (P, K, ...) of values (N, ...) in bins along the profiles, padded with 0."""
@@ -425,11 +421,6 @@ def to_sheet(points: Sequence[np.ndarray], sheet: np.ndarray) -> list[np.ndarray
 def from_sheet(flat: np.ndarray) -> np.ndarray:
     """Return points or directions (n, 3) in the frame of the sheet from their x and z (n, 2)."""
     return np.column_stack([flat[:, 0], np.zeros(len(flat)), flat[:, 1]])
-
-
-def point_by_mount(point: np.ndarray) -> np.ndarray:
-    """Return derivatives (3, 6) of a point (3,) along the platform's axes by shift and rotation of the mount."""
-    return np.hstack([np.eye(3), np.cross(point, np.eye(3))])
 
 
 def _left_jacobian(vector: np.ndarray) -> np.ndarray:
