@@ -7,6 +7,7 @@ import pytest
 
 from tests.uwlts.calibration_views import built_sensor, inside, lattice
 from tests.uwlts.joint_views import TARGET, Noise, gathered, lit_points, seen, step_views, target_series
+from tests.uwlts.scan_views import square_sensor
 from tests.virtual_sensors import altered, with_fine_target
 from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.camera.camera_parameters import TargetImage
@@ -49,8 +50,7 @@ def from_water(in_water, thesis):
 
 def from_steps(thesis, *, height_mm):
     """A target in air and steps in water; the laser's window is square to the sheet, as the step views need it."""
-    laser = BUILT.laser.model_copy(update={"window": BUILT.laser.window.model_copy(update={"tilt_y_deg": 0.0})})
-    sensor = BUILT.model_copy(update={"laser": laser})
+    sensor = square_sensor()
     described = with_fine_target(
         altered(thesis, {"uncertainty": {"step_height_mm": height_mm, "window_tilt_deg": 0.01}})
     )

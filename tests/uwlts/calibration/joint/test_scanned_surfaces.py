@@ -17,7 +17,7 @@ from uwlts.calibration.joint import policy
 from uwlts.calibration.joint.estimate import estimate
 from uwlts.calibration.joint.gathering import scan_stripes
 from uwlts.calibration.joint.initial import build_all_scan_evidence, build_scan_evidence
-from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior
+from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior, window_values
 from uwlts.calibration.joint.residuals import STEP, Residuals
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, ScannedPipe, ScannedPlane, ScannedSpheres
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
@@ -25,7 +25,7 @@ from uwlts.errors import CalibrationError, CaptureError, DescriptionError
 from uwlts.fitting.schur_least_squares import LocalPrior
 from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard
 from uwlts.model.parameter_keys import parse_parameter
-from uwlts.model.placement import camera_from_object, laser_pose
+from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Medium
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.triangulation import reconstruct_profile
@@ -52,32 +52,15 @@ SIZE_FOUND = re.compile(r"found ([\d.]+), described as .* \(([-+.\d]+) mm or ([\
 
 def parameters(**std):
     """Return parameters as built and known, except those with a standard uncertainty in ``std``."""
-    nominal, pose = nominal_calibration(SENSOR), laser_pose(SENSOR)
-    window = nominal.window
-    normal = np.array(window.normal) / window.normal[2]
-    sheet = DescribedSheet(
-        pose.normal, pose.axis, camera_from_object(SENSOR)[:3, 3], pose.origin_mm, pose.origin_mm + 36.0 * pose.axis
-    )
-    known = {
-        "window_distance": window.distance_mm,
-        "window_slope_x": normal[0],
-        "window_slope_y": normal[1],
-        "glass_thickness": window.thickness_mm,
-        "glass_index": window.glass_index,
-        "index of water": WATER,
-        "sheet_turn_fan": 0.0,
-        "sheet_turn_axis": 0.0,
-        "sheet_offset": 0.0,
-        "stage_scale": 0.0,
-        "scan_slope_1": 0.0,
-        "scan_slope_2": 0.0,
-    }
+    nominal = nominal_calibration(SENSOR)
+    known = {key.text: value for key, value in window_values(nominal.window).items()} | {"index of water": WATER}
+    known |= dict.fromkeys(("sheet_turn_fan", "sheet_turn_axis", "sheet_offset", "stage_scale", *SLOPE_NAMES), 0.0)
     priors = {
         parse_parameter(text): Prior(value, std.get(text.replace(" ", "_"), 1e-9)) for text, value in known.items()
     }
     camera = SENSOR.camera
     intrinsics = Intrinsics(CameraOptions(), width_px=camera.width_px, height_px=camera.height_px)
-    found = Parameters(intrinsics, sheet, window, ("water",), priors)
+    found = Parameters(intrinsics, DescribedSheet.from_sensor(SENSOR), nominal.window, ("water",), priors)
     return found, found.start(intrinsics.from_model(nominal.camera))
 
 
