@@ -361,19 +361,12 @@ class BoardEvidence(GroupedEvidence[_State]):
         return self._by_images(state[0]) @ np.array([image.by_sensor for image in self.images])
 
     def jacobian(self, state: _State, step: np.ndarray | None = None) -> np.ndarray:
-        at = np.zeros(12) if step is None else self.free @ step
-
-        def residuals(every: np.ndarray) -> np.ndarray:
-            return self.residuals(self._apply_step(state, every))
-
-        return differences(residuals, at, np.tile(POSE_STEPS, 2)).reshape(-1, 6, 12) @ self.free
+        at, steps = np.zeros(self.size) if step is None else step, np.tile(POSE_STEPS, 2) @ self.free
+        return differences(partial(self.residuals, state), at, steps).reshape(-1, 6, self.size)
 
     def apply_step(self, state: _State, step: np.ndarray) -> _State:
-        return self._apply_step(state, self.free @ step)
-
-    def _apply_step(self, state: _State, step: np.ndarray) -> _State:
         """Shift and rotate the mount along the platform's axes, then the target about its middle."""
-        mount, common = state
+        (mount, common), step = state, self.free @ step
         turned = Rotation.from_rotvec(step[3:6]).as_matrix() @ mount[:3, :3]
         return rigid_transform(turned, mount[:3, 3] + step[:3]), move_about(common, self.middle, step[6:])
 
