@@ -251,14 +251,9 @@ def deviations(result: Estimate, *, least: float = _DOUBTFUL) -> list[Deviation]
 
 @dataclass(frozen=True)
 class PriorDeviations:
-    """Deviations of ``every`` parameter of an estimate from prior knowledge, the largest first."""
+    """Deviations of ``every`` parameter of an estimate (`deviations` with a limit of 0)."""
 
     every: list[Deviation]
-
-    @classmethod
-    def from_estimate(cls, result: Estimate) -> "PriorDeviations":
-        """Compare an estimate with its prior knowledge."""
-        return cls(deviations(result, least=0.0))
 
     @cached_property
     def birge_ratio(self) -> float:

@@ -149,7 +149,7 @@ def _solve_with_observed_uncertainties(problem: JointProblem) -> tuple[Estimate,
     done if a single other parameter contradicts prior knowledge, nor again for an incomplete model.
     """
     result = problem.solve()
-    seen, sensor = PriorDeviations.from_estimate(result), problem.sensor
+    seen, sensor = PriorDeviations(deviations(result, least=0.0)), problem.sensor
     contradictions, doubts, factor = [], [], 1.0
     if problem.misfits or not seen.show_understated():
         against = check_consistency(result, problem.evidence, sensor=sensor)
@@ -344,7 +344,7 @@ class _Attempt:
 
         An incomplete model also biases lens and poses, so that kinds of residuals that fit well are affected too.
         """
-        halves = self.problem.linearise(self.result).disagreements()
+        halves = [h for h in self.problem.linearise(self.result).compare_halves() if h.sigmas() > HALVES_APART]
         if not halves and not self.against.all_against():
             return None
         stated = self.problem.sensor
@@ -355,7 +355,7 @@ class _Attempt:
         result, against = solve_and_check(problem)
         result = result.no_surer_than(self.result)
         factor = float(np.median(list(result.std().values()) / np.sqrt(np.diag(self.result.covariance))))
-        said = [each.words() for each in halves[:_MOST_HALVES]]
+        said = [each.words() for each in sorted(halves, key=HalfDifference.sigmas, reverse=True)[:_MOST_HALVES]]
         said += [f"{words}; kept, as too many images are like this" for words in self.against.unfit.values()]
         said += [*self.against.misfits.values(), *self.against.judged]
         said.append(

@@ -11,7 +11,6 @@ from typing import Self
 import numpy as np
 
 from uwlts.calibration.camera.camera_parameters import CameraOptions
-from uwlts.calibration.camera.lens import HALVES_APART
 from uwlts.calibration.joint.estimate import Estimate, Evidence, Noise, estimate, outliers
 from uwlts.calibration.joint.gathering import Gathered, build_priors, usual_distortion
 from uwlts.calibration.joint.initial import (
@@ -310,11 +309,6 @@ class LinearisedEstimate:
             values.append(self._result.values - inverse @ (gradient + rest_gradient))
             covariances.append(inverse)
         return compare_estimates(self._result.parameters.keys, values, covariances, rest)
-
-    def disagreements(self) -> list[HalfDifference]:
-        """Return the parameters whose halves differ by more than their uncertainties allow, the largest first."""
-        far = [each for each in self.compare_halves() if each.sigmas() > HALVES_APART]
-        return sorted(far, key=HalfDifference.sigmas, reverse=True)
 
     def covariance_with(self, tied: Collection[ParameterKey]) -> np.ndarray:
         """Return the covariance (P, P) if ``tied`` parameters keep their prior value and uncertainty.

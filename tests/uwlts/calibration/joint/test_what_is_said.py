@@ -163,7 +163,7 @@ def test_descriptions_that_are_all_too_sure_are_noticed(count, off, factor):
     """Six squares exceed 22.5 once in a thousand times: 13.5 do not, 37.5 do."""
     keys = [*WindowParameter, SheetParameter.BOW][:count]
     known = {key: ((0.0, 1.0), ((-1) ** n * off, 1e-3)) for n, key in enumerate(keys)}
-    assert PriorDeviations.from_estimate(estimate_of(known)[0]).birge_ratio == pytest.approx(factor, rel=1e-3)
+    assert PriorDeviations(deviations(estimate_of(known)[0], least=0.0)).birge_ratio == pytest.approx(factor, rel=1e-3)
 
 
 @pytest.mark.parametrize(("share", "wrong"), [(0.07, None), (0.09, False), (-0.09, False), (-0.21, True), (0.21, True)])
