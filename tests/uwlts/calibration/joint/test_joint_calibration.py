@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.uwlts.calibration_views import WATER, built_sensor
-from tests.uwlts.joint_views import Noise, assert_derivatives, gathered, lit_points, step_views, target_series
+from tests.uwlts.joint_views import Noise, assert_derivatives, edited, gathered, lit_points, step_views, target_series
 from tests.uwlts.scan_views import square_sensor
 from tests.uwlts.simulated_campaign import ModelErrors, drawn_reality, evidence
 from tests.virtual_sensors import altered
@@ -268,13 +268,11 @@ def test_steps_add_the_window_to_a_target_in_air(thesis):
 def test_outliers_do_not_count(in_water, thesis):
     clean = solve_jointly(gathered(thesis, [in_water]), options=OPTIONS)
     rng = np.random.default_rng(1)
-    images = []
-    for image in in_water.found.images:
-        pixels = image.pixels.copy()
-        pixels[rng.random(len(pixels)) < 0.02] += 3.0
-        images.append(replace(image, pixels=pixels))
-    spoilt = replace(in_water, found=replace(in_water.found, images=images))
-    result = solve_jointly(gathered(thesis, [spoilt]), options=OPTIONS)
+
+    def spoilt(_, image):
+        return replace(image, pixels=image.pixels + 3.0 * (rng.random((len(image.pixels), 1)) < 0.02))
+
+    result = solve_jointly(gathered(thesis, [edited(in_water, spoilt)]), options=OPTIONS)
     moved = np.abs(result.estimate.values - clean.estimate.values) / np.sqrt(np.diag(clean.estimate.covariance))
     assert result.estimate.outliers >= 50
     assert moved.max() < 1.0
@@ -284,13 +282,12 @@ def test_images_that_no_camera_explains_are_refused_and_the_worst_named(thesis):
     """Points in waves of 4 px, in one image of 6; a thousandth of the focal length, 2.4 px, is allowed."""
     air = target_series(BUILT, window=False, positions=AIR[::2], columns=13)
 
-    def off(number, image):
-        return (6.0 if number == 3 else 4.0) * np.sin(image.pixels[:, ::-1] / 30.0)
+    def waved(number, image):
+        off = (6.0 if number == 3 else 4.0) * np.sin(image.pixels[:, ::-1] / 30.0)
+        return replace(image, pixels=image.pixels + off)
 
-    images = [replace(each, pixels=each.pixels + off(number, each)) for number, each in enumerate(air.found.images)]
-    spoilt = replace(air, found=replace(air.found, images=images))
     with pytest.raises(CalibrationError, match="no camera fits the target images in air: .* in target, frame 3: "):
-        solve_jointly(gathered(thesis, [spoilt]), options=OPTIONS)
+        solve_jointly(gathered(thesis, [edited(air, waved)]), options=OPTIONS)
 
 
 def test_a_target_without_stripes_is_refused(in_water, thesis):
