@@ -82,10 +82,6 @@ class StripeEvidence(ABC):
     predicted: np.ndarray | None = None
 
     @abstractmethod
-    def residuals(self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray) -> list[Residuals] | None:
-        """Return the residuals of each image; None if a ray does not meet the object."""
-
-    @abstractmethod
     def local_std(self, uncertainty: Uncertainty) -> np.ndarray:
         """Return the prior standard uncertainty (b,) of the local parameters; infinite without prior knowledge."""
 
@@ -470,6 +466,7 @@ class StepProfileEvidence(StripeEvidence):
         return np.full(2, np.inf)
 
     def residuals(self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray) -> list[Residuals] | None:
+        """Return the residuals of the image; None if a ray does not meet the sheet."""
         points = self.on_sheet(parameters, global_values).points()
         if points is None:
             return None
