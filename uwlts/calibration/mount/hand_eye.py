@@ -95,12 +95,11 @@ def mount_by_board(
     used, state = problem.select(kept), estimate.state
     _, position_mm, _ = estimate.scatter
     extent = float(np.linalg.norm(np.ptp(target.points_mm, axis=0)))
-    left_out = [image for image in images if image not in used.images]
     if position_mm > _NO_FIT * extent or 2 * len(used.images) < len(images):
         raise CalibrationError(
             f"no mount fits the images: the poses would have errors of {position_mm:.3g} mm (rms), with "
-            f"{len(left_out)} of {len(images)} images rejected. Check that the poses are T_base_platform, their "
-            "format, their units, and that they are in the order of the images"
+            f"{len(images) - len(used.images)} of {len(images)} images rejected. Check that the poses are "
+            "T_base_platform, their format, their units, and that they are in the order of the images"
         )
     if axis is not None and state[0][2, :3] @ SENSOR_AXES[axis] <= 0:
         raise CalibrationError(
@@ -110,8 +109,7 @@ def mount_by_board(
     covariance, share, factor = mount_covariance(
         estimate, used.free, state[0][:3, :3], known, lambda: used.residual_derivatives(state)
     )
-    turns = Rotation.from_matrix([image.base_from_platform[:3, :3] for image in used.images])
-    weak = weaknesses(covariance[:6, :6], turns, table=used.table)
+    weak = weaknesses(covariance[:6, :6], rotations[np.flatnonzero(kept)], table=used.table)
     require_determined(covariance, weak)
     found = {image.name: used.offsets_mm(state)[k] for k, image in enumerate(used.images)}
     others = [used.apply_step(state, step) for step, _ in estimate.without_each]
