@@ -193,7 +193,7 @@ def _fit(
 
     def model(group: int, global_values: np.ndarray, local: np.ndarray) -> Sequence[Observation | LocalPrior] | None:
         if group == len(evidence):
-            return _prior_observations(parameters, global_values)
+            return prior_observations(parameters, global_values)
         piece = evidence[group]
         parts = piece.residuals(parameters, global_values, local)
         if parts is None:
@@ -211,7 +211,7 @@ def _fit(
     return schur_least_squares(model, global_values, starts, **first, enough_rounds=_FIRST_ROUNDS)
 
 
-def _prior_observations(parameters: Parameters, global_values: np.ndarray) -> list[Observation]:
+def prior_observations(parameters: Parameters, global_values: np.ndarray) -> list[Observation]:
     """Return prior knowledge: of single parameters, and of many jointly from an earlier estimate."""
     std = parameters.prior_std()
     known = np.isfinite(std)

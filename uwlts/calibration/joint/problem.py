@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 
 from uwlts.calibration.camera.camera_parameters import CameraOptions
-from uwlts.calibration.joint.estimate import Estimate, Evidence, Noise, estimate, outliers
+from uwlts.calibration.joint.estimate import Estimate, Evidence, Noise, estimate, outliers, prior_observations
 from uwlts.calibration.joint.gathering import Gathered, build_priors, usual_distortion
 from uwlts.calibration.joint.initial import (
     build_all_scan_evidence,
@@ -222,13 +222,8 @@ class LinearisedEstimate:
         self._normal = {image: self._sum_products(image) for image in self._parts}
         self._targets = [image for image in self._parts if isinstance(evidence[image[0]], TargetEvidence)]
         self._shared = [image for image in self._parts if isinstance(evidence[image[0]], SurfaceScanEvidence)]
-        std = result.parameters.prior_std()
-        self._prior = np.diag(np.where(np.isfinite(std), 1.0 / np.square(np.where(std > 0, std, 1.0)), 0.0))
-        self._prior_gradient = self._prior @ (result.values - result.parameters.prior_mean())
-        if (earlier := result.parameters.earlier) is not None:
-            off, by_global = earlier.residuals(result.values)
-            self._prior = self._prior + by_global.T @ by_global
-            self._prior_gradient = self._prior_gradient + by_global.T @ off
+        prior = normal_equations(prior_observations(result.parameters, result.values), self._count, 0)[0]
+        self._prior, self._prior_gradient = prior[:-1, :-1], prior[:-1, -1]
 
     def _sum_products(self, image: ImageId) -> np.ndarray:
         noise, size = self._result.noise, len(self._prior_of[image[0]]) - self._count - 1
