@@ -222,33 +222,29 @@ class LinearisedEstimate:
         self._normal = {image: self._sum_products(image) for image in self._parts}
         self._targets = [image for image in self._parts if isinstance(evidence[image[0]], TargetEvidence)]
         self._shared = [image for image in self._parts if isinstance(evidence[image[0]], SurfaceScanEvidence)]
-        prior = normal_equations(prior_observations(result.parameters, result.values), self._count, 0)[0]
-        self._prior, self._prior_gradient = prior[:-1, :-1], prior[:-1, -1]
+        self._prior = normal_equations(prior_observations(result.parameters, result.values), self._count, 0)[0]
 
     def _sum_products(self, image: ImageId) -> np.ndarray:
         noise, size = self._result.noise, len(self._prior_of[image[0]]) - self._count - 1
         rows = [part.weighted(noise[part.kind].effective_px(), used) for part, used in self._parts[image]]
         return normal_equations(rows, self._count, size)[0]
 
-    def _reduce(self, chosen: Collection[ImageId]) -> tuple[np.ndarray, np.ndarray, dict[int, tuple[np.ndarray, ...]]]:
-        """Return the normal equations (P, P) and (P,) of chosen images without prior knowledge of global parameters.
+    def _reduce(self, chosen: Collection[ImageId]) -> tuple[np.ndarray, dict[int, np.ndarray]]:
+        """Return the normal equations (P + 1, P + 1) of chosen images and prior knowledge, the gradient last.
 
-        Local parameters are eliminated. The third result gives them for a change (P,) of the global parameters.
+        Local parameters are eliminated. The second result gives their step, -B @ (step, 1), by a matrix B (b, P + 1).
         """
-        p = self._count
-        total, gradient, backwards = np.zeros((p, p)), np.zeros(p), {}
-        sums: dict[int, np.ndarray] = {}
+        p, total, backwards = self._count, self._prior.copy(), {}
+        keep, sums = np.r_[:p, -1], dict[int, np.ndarray]()
         for number, image in sorted(chosen):
             sums[number] = sums.get(number, self._prior_of[number]) + self._normal[number, image]
         for number, product in sums.items():
-            border, own_gradient = product[:p, p:-1], product[p:-1, -1]
-            inverse = _invert(product[p:-1, p:-1])
+            border, inverse = product[p:-1, keep], _invert(product[p:-1, p:-1])
             if inverse is None:
                 continue  # too few points of an image for its pose: it says nothing
-            total += product[:p, :p] - border @ inverse @ border.T
-            gradient += product[:p, -1] - border @ inverse @ own_gradient
-            backwards[number] = (inverse, border, own_gradient)
-        return total, gradient, backwards
+            backwards[number] = inverse @ border
+            total += product[np.ix_(keep, keep)] - border.T @ backwards[number]
+        return total, backwards
 
     def predict(self) -> HeldOut:
         """Predict each fifth of the target images, with the stripes on them, from all other images.
@@ -265,11 +261,11 @@ class LinearisedEstimate:
             raise CalibrationError("too few images of a target to predict one from the others")
         for fold in range(folds):
             held = self._targets[fold::folds]
-            total, gradient, backwards = self._reduce(set(self._parts) - set(held))
-            inverse = _invert(total + self._prior)
+            total, backwards = self._reduce(set(self._parts) - set(held))
+            inverse = _invert(total[:-1, :-1])
             if inverse is None:
                 raise CalibrationError("without some of the images, the others do not determine the calibration")
-            step = -inverse @ (gradient + self._prior_gradient)
+            step = -inverse @ total[:-1, -1]
             for image in held:
                 columns: list[tuple[np.ndarray, ...]] = []
                 for part, used in self._parts[image]:
@@ -279,8 +275,7 @@ class LinearisedEstimate:
                     columns.append(tuple(c[used] for c in (part.values + part.by_global @ step, by_local, kind)))
                 moved, by_local, kind = (np.concatenate(column) for column in zip(*columns, strict=True))
                 if image[0] in backwards:
-                    local_inverse, border, own_gradient = backwards[image[0]]
-                    local = -(local_inverse @ (own_gradient + border.T @ step))
+                    local = -backwards[image[0]] @ np.append(step, 1.0)
                 else:
                     points = kind == TARGET
                     local = -np.linalg.lstsq(by_local[points], moved[points], rcond=None)[0]
@@ -294,14 +289,12 @@ class LinearisedEstimate:
         """
         if len(self._targets) < _FEWEST_IMAGES:
             return []
-        rest, rest_gradient, _ = self._reduce(self._shared)
-        rest, rest_gradient = rest + self._prior, rest_gradient + self._prior_gradient
-        values, covariances = [], []
+        rest, values, covariances = self._reduce(self._shared)[0][:-1, :-1], [], []
         for half in self._halves:
-            total, gradient, _ = self._reduce(half)
-            if (inverse := _invert(total + rest)) is None:
+            total, _ = self._reduce([*half, *self._shared])
+            if (inverse := _invert(total[:-1, :-1])) is None:
                 return []
-            values.append(self._result.values - inverse @ (gradient + rest_gradient))
+            values.append(self._result.values - inverse @ total[:-1, -1])
             covariances.append(inverse)
         return compare_estimates(self._result.parameters.keys, values, covariances, rest)
 
@@ -312,17 +305,15 @@ class LinearisedEstimate:
         """
         keys = self._result.parameters.keys
         held = np.array([key in tied for key in keys])
-        total = self._reduce(self._parts)[0] + self._prior
+        total = self._reduce(self._parts)[0][:-1, :-1]
         inverse = _invert(total[np.ix_(~held, ~held)])
         if inverse is None:
             raise CalibrationError("the evidence does not determine the calibration")
         variance = np.diag(np.square(self._result.parameters.prior_std()[held]))
-        by_held = -inverse @ total[np.ix_(~held, held)]
-        covariance = np.zeros_like(total)
-        covariance[np.ix_(~held, ~held)] = inverse + by_held @ variance @ by_held.T
-        covariance[np.ix_(~held, held)] = by_held @ variance
-        covariance[np.ix_(held, ~held)] = variance @ by_held.T
-        covariance[np.ix_(held, held)] = variance
+        by_held = np.eye(len(held))[:, held]
+        by_held[~held] = -inverse @ total[np.ix_(~held, held)]
+        covariance = by_held @ variance @ by_held.T
+        covariance[np.ix_(~held, ~held)] += inverse
         return covariance
 
 
