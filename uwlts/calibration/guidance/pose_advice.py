@@ -133,7 +133,7 @@ class Coverage:
         empty = ~self.covered
         if not empty.any():
             return None
-        rows, columns = (np.minimum(3 * np.arange(n) // n, 2) for n in empty.shape)
+        rows, columns = (3 * np.arange(n) // n for n in empty.shape)
         ninths = np.zeros((3, 3))
         np.add.at(ninths, (rows[:, None], columns[None, :]), empty)
         row, column = np.unravel_index(int(np.argmax(ninths)), (3, 3))
@@ -414,14 +414,13 @@ def format_pose_advice(aim: np.ndarray, state: State, pose: np.ndarray | None) -
 def _tilt_words(aim: np.ndarray, pose: np.ndarray | None) -> str:
     """Describe how to tilt the target: the side to move away, and the angle."""
     across, down = tilts_rad(aim)
-    size = np.degrees(np.arccos(np.clip(1 / np.sqrt(1 + np.tan(across) ** 2 + np.tan(down) ** 2), -1, 1)))
+    size, present = (np.degrees(np.arccos(np.clip(abs(p[2, 2]), 0, 1))) for p in (aim, aim if pose is None else pose))
     if size < 5:
         return "hold the target square to the camera"
     farther = {"lower": down, "upper": -down, "right": across, "left": -across}
     sides = [side for side, tilt in farther.items() if tilt > np.radians(5)]
     what = f"{sides[0]} side" if len(sides) == 1 else f"{' '.join(sides)} corner"
-    present = 1.0 if pose is None else np.clip(abs(pose[2, 2]), 0, 1)
-    now = "" if pose is None else f" (now it is tilted by {np.degrees(np.arccos(present)):.0f} deg)"
+    now = "" if pose is None else f" (now it is tilted by {present:.0f} deg)"
     return f"tilt the target so that its {what} is farther, {size:.0f} deg{now}"
 
 
