@@ -10,8 +10,8 @@ from scipy.stats import chi2
 
 from uwlts.calibration.joint.estimate import UNSETTLED, Estimate, Evidence, outliers
 from uwlts.calibration.joint.gathering import USUAL_DISTORTION
-from uwlts.calibration.joint.residuals import SHIFT, STRETCH, TARGET, Residuals, TargetEvidence
-from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
+from uwlts.calibration.joint.residuals import BENDS, SHIFT, STRETCH, TARGET, Residuals, TargetEvidence
+from uwlts.calibration.joint.scanned_surfaces import SLOPES, SurfaceScanEvidence
 from uwlts.fitting.least_squares import robust_std
 from uwlts.model.parameter_keys import (
     LensParameter,
@@ -27,7 +27,6 @@ from uwlts.model.parameter_keys import (
 )
 from uwlts.model.sensor import Sensor
 
-_ALIGNMENT = "stage_direction in the captures, or uncertainty.stage_alignment_deg"
 _CHECK: dict[SingleParameter, str] = {
     WindowParameter.DISTANCE: "camera.window.distance_mm or uncertainty.window_distance_mm",
     WindowParameter.SLOPE_X: "the window's tilts or uncertainty.window_tilt_deg",
@@ -36,16 +35,11 @@ _CHECK: dict[SingleParameter, str] = {
     WindowParameter.GLASS_INDEX: "camera.window.glass",
     SheetParameter.BOW: "the target's flatness, the laser, or uncertainty.bow_deg",
     SheetParameter.WINDOW_TURN: "the medium, or uncertainty.laser_window_tilt_deg",
-    StageParameter.SLOPE_1: _ALIGNMENT,
-    StageParameter.SLOPE_2: _ALIGNMENT,
-    TargetParameter.BOW: "the target's flatness, or uncertainty.target_bow_mm",
-    TargetParameter.SADDLE: "the target's flatness, or uncertainty.target_bow_mm",
-    TargetParameter.TWIST: "the target's flatness, or uncertainty.target_bow_mm",
-    TargetParameter.STRETCH_X: "the target's spacings, or uncertainty.target_stretch",
-    TargetParameter.STRETCH_Y: "the target's spacings, or uncertainty.target_stretch",
+    **dict.fromkeys(SLOPES, "stage_direction in the captures, or uncertainty.stage_alignment_deg"),
+    **dict.fromkeys(BENDS, "the target's flatness, or uncertainty.target_bow_mm"),
+    **dict.fromkeys(STRETCH, "the target's spacings, or uncertainty.target_stretch"),
     **dict.fromkeys((LensParameter.F, LensParameter.FX, LensParameter.FY), "the target's spacing, lens and focus"),
-    LensParameter.P1: "the lens, or uncertainty.tangential",
-    LensParameter.P2: "the lens, or uncertainty.tangential",
+    **dict.fromkeys((LensParameter.P1, LensParameter.P2), "the lens, or uncertainty.tangential"),
 }
 """Entries to check for the parameters with prior knowledge."""
 
