@@ -389,8 +389,9 @@ def test_images_of_a_scan_are_left_out_as_long_as_enough_agree(thesis, target_in
     seen = replace(gathered(thesis, [target_in_water]), scans=[scanned("spheres")])
     assert seen.remove_images({"spheres.h5, at 0 mm"}).scans[0].image_names() == seen.scans[0].image_names()
     (kept,) = seen.remove_images({"spheres.h5, at 0 mm", "spheres.h5, at -18 mm"}).scans
-    assert np.unique(kept.frame).tolist() == sorted({*seen.scans[0].frame.tolist()} - {0, 6})
-    assert len(kept.line) == len(kept.slopes) == np.isin(seen.scans[0].frame, kept.frame).sum()
+    every, frames = seen.scans[0].found.frame, kept.found.frame
+    assert np.unique(frames).tolist() == sorted({*every.tolist()} - {0, 6})
+    assert len(kept.found.line) == len(kept.slopes) == np.isin(every, frames).sum()
     assert seen.remove_images({f"spheres.h5, at {position:g} mm" for position in STAGE[:4]}) is None
 
 
@@ -398,9 +399,7 @@ def test_scans_that_do_not_show_what_they_say_are_left_out():
     bodies, plane = KINDS["plane"]
     stripes, _ = scan_of(SENSOR, bodies, plane, stage_mm=STAGE[:3], count=300)
     wrong = replace(stripes, artefact=PipeStandard(diameter_mm=220.0), source="pipe.h5")
-    few = replace(
-        stripes, **{name: getattr(stripes, name)[::4] for name in ("frame", "line", "centre_px", "width_px", "slopes")}
-    )
+    few = replace(stripes, found=stripes.found[::4], slopes=stripes.slopes[::4])
     found, warnings = build_all_scan_evidence(
         [wrong, few, stripes], nominal_calibration(SENSOR), SENSOR, [WATER], sizes_known=True
     )
@@ -455,10 +454,11 @@ def test_what_blur_and_the_sheets_thickness_leave_is_common_to_all_points():
     square = Body((0.0, 0.0, 40.0), None, (0.0, 0.0, 1.0))
     stripes, _ = scan_of(SENSOR, (square,), PlaneStandard(), stage_mm=STAGE, count=300)
     nominal, rng = nominal_calibration(SENSOR), np.random.default_rng(4)
-    blur, slopes = rng.normal(0, 0.05, len(stripes.line)), rng.normal(0, 0.05, len(stripes.line))
+    seen = stripes.found
+    blur, slopes = rng.normal(0, 0.05, (2, len(seen.line)))
     given = {"medium_index": WATER, "sizes_known": True, "image": 0}
     plain, _ = build_scan_evidence(replace(stripes, blur_px=blur, slopes=0 * slopes), nominal, SENSOR, **given)
-    kept = np.searchsorted(stripes.frame * 1e6 + stripes.line, plain.frame * 1e6 + plain.pixels[:, 0])
+    kept = np.searchsorted(seen.frame * 1e6 + seen.line, plain.frame * 1e6 + plain.pixels[:, 0])
     np.testing.assert_allclose(plain.common_px, np.abs(blur[kept]) / np.sqrt(3), rtol=1e-9)
     common = {}
     for thickness in (0.1, 0.3):
@@ -468,11 +468,11 @@ def test_what_blur_and_the_sheets_thickness_leave_is_common_to_all_points():
         common[thickness] = found.common_px
     np.testing.assert_allclose(common[0.3], 3 * common[0.1], rtol=1e-9)
     moved_z = np.abs(nominal.object_transform()[:3, 2] @ found.beside_mm)
-    below = replace(stripes, centre_px=stripes.centre_px + 1.0)
+    below = replace(seen, centre_px=seen.centre_px + 1.0)
     z = [
         reconstruct_profile(
             nominal, each.line, each.centre_px, medium_index=WATER, stage_mm=0.0, stage_direction=np.array([1.0, 0, 0])
         ).points_mm[:, 2]
-        for each in (stripes, below)
+        for each in (seen, below)
     ]
     np.testing.assert_allclose(common[0.1], 0.2 * moved_z / np.abs(z[1] - z[0])[kept], rtol=0.02)
