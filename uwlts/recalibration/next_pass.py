@@ -45,11 +45,8 @@ def _candidates(problem: PassProblem, solution: PassSolution) -> Iterator[NextPa
         placed, there = seen
         count = problem.unknowns
         by = np.einsum("ni,niu->nu", normals[there], placed)
-        added = np.zeros((len(by), len(by[0])))
-        added[:, : problem.of_sensor] = by[:, : problem.of_sensor]
-        added[:, count:] = by[:, count:]
-        added[:, :count] -= rows[there]
-        information = (added.T / (1 / each[there] + 1 / weight[there]) / solution.spread**2) @ added
+        by[:, :count] -= rows[there]
+        information = (by.T / (1 / each[there] + 1 / weight[there]) / solution.spread**2) @ by
         information[count:, count:] += np.eye(len(information) - count)
         yield NextPass(words=words, information=eliminate_others(information, count), pose=pose)
 
