@@ -1,4 +1,4 @@
-"""What is changed because of residuals: lens coefficients, pixels, weights, and images that are left out."""
+"""Changes of a calibration because of its residuals: lens coefficients, pixels, weights, and rejected images."""
 
 from dataclasses import replace
 
