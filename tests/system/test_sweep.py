@@ -1,4 +1,4 @@
-"""Whole sweeps by the command: stopped and continued, shared, on a Dask cluster that loses a worker, and their end.
+"""Whole sweeps by the command: stopped and continued, on a Dask cluster that loses a worker, and their end.
 
 Only formulas are used here; the rendering of designs is tested with the verification.
 """
@@ -154,17 +154,6 @@ def _scene(folder: Path) -> Path:
     path = folder / "board.toml"
     path.write_text('title = "Board"\n[[objects]]\nkind = "plate"\nwidth_mm = 50.0\nheight_mm = 300.0\n')
     return path
-
-
-def test_two_machines_share_a_study(study, tmp_path, expected):
-    out = tmp_path / "out"
-    first = begun(study, out, "--workers", "1")
-    until(lambda: len(list_parts(out / "screen")) >= 1)
-    second = begun(study, out, "--workers", "1")
-    for process in (first, second):
-        _, said = process.communicate(timeout=200)
-        assert process.returncode == 0, said
-    same(out, expected)
 
 
 def test_a_study_is_not_mixed_with_another(study, tmp_path):

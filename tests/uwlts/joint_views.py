@@ -1,6 +1,6 @@
 """Evidence for the joint calibration, in air and in a medium, by Fermat's principle, without the sensor software."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -82,6 +82,13 @@ def target_series(sensor, *, medium=None, window=True, positions, bow=0.0, noise
     names = [(0, n) for n in range(len(images))]
     evidence = AirEvidence(TARGET, images, names, stripes, [], outliers=[0] * len(images), captures=["target"])
     return Series(ViewMedium(window, medium), evidence, None if tilts is not None else True)
+
+
+def edited(series, edit=lambda number, image: image, *, every=1):
+    """Return the series with each image replaced by ``edit(number, image)``, and ``every`` n-th pixel of stripes."""
+    images = [edit(*each) for each in enumerate(series.found.images)]
+    stripes = [pixels[::every] for pixels in series.found.stripes]
+    return replace(series, found=replace(series.found, images=images, stripes=stripes))
 
 
 def step_views(sensor: Sensor, *, noise=Noise(), tilts=(0.01, -0.02, 0.03)):

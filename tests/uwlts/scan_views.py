@@ -10,6 +10,7 @@ from uwlts.calibration.joint.gathering import ScanStripes
 from uwlts.calibration.joint.parameters import ViewMedium
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Sensor
+from uwlts.model.stripe import CaptureStripes
 from uwlts.optics.brightness import estimate_blur_shift_px
 
 VIEW = ViewMedium(True, 0)
@@ -88,17 +89,13 @@ def scan_of(sensor: Sensor, bodies, artefact, *, stage_mm, count=200, noise=NONE
             pixels.append(found + np.column_stack([np.zeros(len(found)), noise.draw(noise.stripe_px, len(found))]))
             image.append(np.full(len(found), number))
             which.append(np.full(len(found), place))
-    pixels, frames, width = np.vstack(pixels), np.concatenate(image), np.full(sum(map(len, pixels)), 4.0)
+    frames, width, brightness = np.concatenate(image), np.full(sum(map(len, pixels)), 4.0), np.concatenate(brightness)
+    line, centre = np.vstack(pixels).T
     stripes = ScanStripes(
         source,
-        frames,
-        pixels[:, 0],
-        pixels[:, 1],
-        width,
-        estimate_blur_shift_px(
-            frames, np.rint(pixels[:, 0]).astype(int), pixels[:, 1], np.concatenate(brightness), width
-        ),
-        np.zeros(len(pixels)),
+        CaptureStripes(frames, line, centre, brightness, width, {}),
+        estimate_blur_shift_px(frames, np.rint(line).astype(int), centre, brightness, width),
+        np.zeros(len(line)),
         np.asarray(stage_mm, dtype=float),
         np.array([1.0, 0.0, 0.0]),
         artefact,

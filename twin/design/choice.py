@@ -24,23 +24,19 @@ from twin.design.designs import (
     select_design,
 )
 from twin.design.figures_of_merit import (
+    DEPTH_SHARES,
     DEPTHS,
+    LINE_SHARES,
     PLACES,
     RENDERED_SCATTERING_DEPTH,
     Field,
-    evaluate_field,
+    evaluate_volume,
     find_depths_in_view,
 )
-from twin.design.sensor_arrays import (
-    PARAMETER_OF,
-    SensorArrays,
-    adjust_to_standoff,
-    extract_numbers,
-    list_independent_paths,
-)
+from twin.design.sensor_arrays import PARAMETER_OF, SensorArrays, extract_numbers, list_independent_paths
 from twin.design.study import Study
 from twin.rendering_options import use_variant
-from uwlts.errors import DesignError, Error, EvaluationError, RangeError
+from uwlts.errors import DesignError, Error, EvaluationError
 from uwlts.optics.design import Array, standoff_mm
 
 
@@ -50,12 +46,7 @@ def find_pareto_front(values: np.ndarray) -> np.ndarray:
     A design is on the front if no other design is at least as good in all values and better in one. Equal designs have
     the same result. A design with a NaN is neither on the front nor compared with others. Up to two values need one
     sort; more values need a pass over the designs for each design of the front (Kung et al. 1975).
-
-    Raises RangeError if the values are not a table with at least one column.
     """
-    values = np.asarray(values, dtype=np.float64)
-    if values.ndim != 2 or values.shape[1] == 0:
-        raise RangeError(f"the values have the shape {values.shape}; expected (designs, values), at least one value")
     front = np.zeros(len(values), dtype=bool)
     candidates = np.flatnonzero(~np.isnan(values).any(axis=1))
     if len(candidates):
@@ -92,21 +83,21 @@ def _front_of_many(values: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class StudyResults:
-    """Study and columns of its N evaluated designs, possibly none; EvaluationError for columns of another study."""
+    """Study and columns of its N evaluated designs; EvaluationError for columns of another study."""
 
     study: Study
     columns: Columns
 
     def __post_init__(self) -> None:
         expected = ["design", "violation", "failure", *self.study.free(), *(o.figure for o in self.study.objectives)]
-        if self.columns and (missing := [name for name in expected if name not in self.columns]):
+        if missing := [name for name in expected if name not in self.columns]:
             raise EvaluationError(
                 f"the results lack the columns {', '.join(missing)}; found {', '.join(self.columns)}: "
                 "use the results of this study"
             )
 
     def __len__(self) -> int:
-        return len(self.columns["design"]) if self.columns else 0
+        return len(self.columns["design"])
 
     def figure(self, name: str) -> np.ndarray:
         """Return a figure (N,) of all designs; NaN if it is unknown."""
@@ -120,7 +111,7 @@ class StudyResults:
     @cached_property
     def failures(self) -> list[str]:
         """Reasons why designs cannot work, "" for working designs."""
-        return [text or "" for text in self.columns["failure"].tolist()] if self.columns else []
+        return [text or "" for text in self.columns["failure"].tolist()]
 
     @cached_property
     def works(self) -> np.ndarray:
@@ -156,25 +147,15 @@ class StudyResults:
         )
 
 
-@dataclass(frozen=True)
-class DesignChoice:
-    """Chosen designs and notes.
+def choose(
+    study: Study, columns: Columns
+) -> tuple[tuple[HighlightedDesign, ...], list[HighlightedDesign], tuple[str, ...]]:
+    """Choose the best design by the first objective among those that meet the constraints; return further ones, too.
 
-    ``marked`` contains the base sensor if it works, the best design, and the refined design if it is better; the last
-    one is the winner. ``further`` are other designs to render.
-    """
-
-    marked: tuple[HighlightedDesign, ...]
-    further: tuple[HighlightedDesign, ...]
-    notes: tuple[str, ...]
-
-
-def choose(study: Study, columns: Columns) -> DesignChoice:
-    """Choose the best design by the first objective among those that meet the constraints, and further designs.
-
-    If no design meets the constraints, the one with the smallest violation is chosen, with a note. The further designs
-    are spread over the Pareto front; their number is that of the study's designs to render, less one. Raises
-    DesignError if no design works.
+    Returns the designs to mark, further designs to render, and notes. Marked are the base sensor if it works, the best
+    design, and the refined design if it is better; the last one is the winner. If no design meets the constraints, the
+    one with the smallest violation is chosen, with a note. The further designs are spread over the Pareto front; their
+    number is that of the study's designs to render, less one. Raises DesignError if no design works.
     """
     marked, notes = [], []
     base, found = study.sensor, StudyResults(study, columns)
@@ -212,7 +193,7 @@ def choose(study: Study, columns: Columns) -> DesignChoice:
     spread = front[np.unique(np.linspace(0, len(front) - 1, study.verify + 1).round().astype(int))]
     others = [int(place) for place in spread if place != best][: max(study.verify - 1, 0)]
     further = [found.highlight(place, "on the Pareto front") for place in others]
-    return DesignChoice(tuple(marked), tuple(further), tuple(notes))
+    return tuple(marked), further, tuple(notes)
 
 
 def describe_turbidity(one: HighlightedDesign) -> str:
@@ -278,16 +259,13 @@ class DerivedFigures:
 
     def __init__(self, study: Study, design: Design, figures: list[str]):
         use_variant()
-        import drjit as dr
         from drjit.llvm.ad import Float64
 
-        self._dr, self._float = dr, Float64
         sensor = make_sensor(study, design)
         self.paths = [path for path in list_independent_paths(sensor) if path in study.continuous()]
-        self._figures, self._study = figures, study
+        self._figures, self._study, self._float = figures, study, Float64
         self._parameters = extract_numbers(sensor, study.medium_of(sensor))
-        shares, places = np.meshgrid(np.linspace(0, 1, DEPTHS), np.linspace(-1, 1, PLACES), indexing="ij")
-        self._shares, self._places = Float64(shares.ravel()), Float64(places.ravel() * (1 - 1e-9))
+        self._places = [Float64(shares.ravel()) for shares in np.broadcast_arrays(DEPTH_SHARES, LINE_SHARES)]
 
     def evaluate(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return figures (F,) and derivatives (F, K) at values (K,) of the free numbers, in the units of the paths."""
@@ -296,17 +274,17 @@ class DerivedFigures:
 
     def _differentiate(self, values: np.ndarray, number: int) -> tuple[list[float], list[float]]:
         """Return the figures, and their derivatives with respect to one number."""
-        dr = self._dr
+        import drjit as dr
+
+        names, units = zip(*(PARAMETER_OF[path] for path in self.paths), strict=True)
         # All numbers have gradients, all but one of them 0. They are opaque, so that one kernel serves all.
-        numbers = [self._float(float(v) * PARAMETER_OF[path][1]) for path, v in zip(self.paths, values, strict=True)]
+        numbers = [self._float(float(value) * unit) for value, unit in zip(values, units, strict=True)]
         seeds = [self._float(float(k == number)) for k in range(len(numbers))]
         dr.make_opaque(numbers, seeds)
         dr.enable_grad(numbers)
-        changed = {PARAMETER_OF[path][0]: leaf for path, leaf in zip(self.paths, numbers, strict=True)}
-        p = adjust_to_standoff(dr, replace(self._parameters, **changed), self._study.follow)
-        near, far = find_depths_in_view(dr, p)
-        depths = near + (far - near) * self._shares
-        f = evaluate_field(dr, p, depths, self._places, reflectance=self._study.reflectance)
+        p = replace(self._parameters, **dict(zip(names, numbers, strict=True)))
+        followers, _, _, field = evaluate_volume(dr, p, self._study.follow, self._study.reflectance, *self._places)
+        p, f = replace(p, **followers), Field(**field)
 
         def mean(quantity: Array, depth: int | None = None) -> Array:
             weights = np.zeros((DEPTHS, PLACES))
@@ -320,8 +298,7 @@ class DerivedFigures:
         dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
         changes = [dr.grad(output) for output in outputs]
         dr.eval(outputs, changes)
-        unit = PARAMETER_OF[self.paths[number]][1]
-        return [float(output.numpy()[0]) for output in outputs], [unit * float(c.numpy()[0]) for c in changes]
+        return [float(one.numpy()[0]) for one in outputs], [units[number] * float(c.numpy()[0]) for c in changes]
 
 
 def refine_design(study: Study, design: Design, accepts: Callable[[Design], bool]) -> Design | None:
@@ -371,7 +348,7 @@ def refine_design(study: Study, design: Design, accepts: Callable[[Design], bool
     step = np.clip(found.x, 0, 1) - start
     for _ in range(_HALVINGS):
         if not np.isfinite(step).all() or not step.any():
-            return None
+            break
         values = low + (start + step) * wide
         moved = Design(design.number, design.values | dict(zip(figures.paths, values.tolist(), strict=True)))
         if accepts(moved):

@@ -15,7 +15,6 @@ from twin.backend.llvm import prepare_llvm, preserve_threads
 from twin.design.sensor_arrays import Follow, SensorArrays, compute_adjustments
 from twin.scene.platform_kinds import GRAVITY_M_S2
 from twin.sensor.detector import PLANCK_TIMES_LIGHT
-from uwlts.errors import RangeError
 from uwlts.optics.design import (
     Array,
     ImagePoints,
@@ -359,11 +358,12 @@ def compute_figures(
 
     The figures of a design that cannot work are not meaningful.
     """
-    if not 0 < reflectance <= 1:
-        raise RangeError(f"reflectance is {reflectance:g}; expected a number above 0, up to 1")
     with np.errstate(all="ignore"):
-        over_volume = _over_volume if p.baseline_mm.size < _MANY else _compiled_over_volume
-        followers, near, far, field = over_volume(np, p, tuple(follow), reflectance)
+        if p.baseline_mm.size < _MANY:
+            found = evaluate_volume(np, p, tuple(follow), reflectance, DEPTH_SHARES, LINE_SHARES)
+        else:
+            found = _evaluate_compiled(p, tuple(follow), reflectance)
+        followers, near, far, field = found
         p, f = replace(p, **followers), Field(**field)
         shape = np.broadcast_shapes(f.sigma_z_mm.shape, (p.near_mm.size, DEPTHS, PLACES))
         full = {name: np.broadcast_to(np.asarray(values, dtype=float), shape) for name, values in vars(f).items()}
@@ -372,18 +372,13 @@ def compute_figures(
     return figures, reasons
 
 
-_SHARES = np.linspace(0, 1, DEPTHS).reshape(1, -1, 1)
-# Along the stripe, relative to its half length, just within its ends.
-_PLACES = np.linspace(-1, 1, PLACES).reshape(1, 1, -1) * (1 - 1e-9)
+DEPTH_SHARES = np.linspace(0, 1, DEPTHS).reshape(1, -1, 1)  # of the depth in view
+LINE_SHARES = np.linspace(-1, 1, PLACES).reshape(1, 1, -1) * (1 - 1e-9)
+"""Places along the stripe, relative to its half length, just within its ends."""
 
 
-def _over_volume(
-    xp: ModuleType,
-    p: SensorArrays,
-    follow: tuple[Follow, ...],
-    reflectance: float,
-    shares: Array = _SHARES,
-    places: Array = _PLACES,
+def evaluate_volume(
+    xp: ModuleType, p: SensorArrays, follow: tuple[Follow, ...], reflectance: float, shares: Array, places: Array
 ) -> tuple[dict[str, Array], Array, Array, dict[str, Array]]:
     """Return the adjusted parameters by name, the near and far ends of the volume in view, and its `Field` by name."""
     followers = compute_adjustments(xp, p, follow)
@@ -393,10 +388,10 @@ def _over_volume(
     return followers, near, far, vars(field)
 
 
-def _compiled_over_volume(
-    xp: ModuleType, p: SensorArrays, follow: tuple[Follow, ...], reflectance: float
+def _evaluate_compiled(
+    p: SensorArrays, follow: tuple[Follow, ...], reflectance: float
 ) -> tuple[dict[str, Array], Array, Array, dict[str, Array]]:
-    """Evaluate `_over_volume` with Dr.Jit in a fifth of the time, for two or more designs.
+    """Evaluate `evaluate_volume` with Dr.Jit in a fifth of the time, for two or more designs.
 
     It uses one thread, because sweeps have one process per core. A recording of Dr.Jit is valid for one number of
     designs only. Therefore the designs are split into blocks of equal size; the last block repeats the last design.
@@ -409,13 +404,13 @@ def _compiled_over_volume(
         return tuple(map(converted, values)) if isinstance(values, tuple) else TensorXf64(_align(values))
 
     designs = p.baseline_mm.size
-    over_volume, at = _freeze(follow, reflectance), (converted(_SHARES), converted(_PLACES))
+    evaluate, at = _freeze(follow, reflectance), (converted(DEPTH_SHARES), converted(LINE_SHARES))
     blocks: list[tuple[dict[str, Array], ...]] = []
     with preserve_threads():
         dr.set_thread_count(1)
         for first in range(0, designs, _BLOCK):
             block = p.select(np.minimum(np.arange(first, first + _BLOCK), designs - 1))
-            followers, near, far, field = over_volume({n: converted(values) for n, values in vars(block).items()}, *at)
+            followers, near, far, field = evaluate({n: converted(values) for n, values in vars(block).items()}, *at)
             tables = followers, {"near": near, "far": far}, field
             blocks.append(tuple({name: array.numpy() for name, array in table.items()} for table in tables))
     followers, ends, field = (
@@ -436,10 +431,10 @@ def _align(values: np.ndarray) -> np.ndarray:
 
 @cache
 def _freeze(follow: tuple[Follow, ...], reflectance: float) -> Callable[..., Any]:
-    """Return `_over_volume` as a function that Dr.Jit records at the first call and replays for other values."""
+    """Return `evaluate_volume` as a function that Dr.Jit records at the first call and replays for other values."""
     import drjit as dr
 
-    return dr.freeze(lambda given, *at: _over_volume(dr, SensorArrays(**given), follow, reflectance, *at))
+    return dr.freeze(lambda given, *at: evaluate_volume(dr, SensorArrays(**given), follow, reflectance, *at))
 
 
 def _each(values: Array, designs: int) -> np.ndarray:

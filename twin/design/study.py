@@ -63,32 +63,23 @@ class Variable(Description):
             raise DescriptionError(f"a variable with the values {self.values} is not a range with least and most")
         return self.least, self.most
 
-    def value_at(self, share: float) -> Value:
-        """Return the value at a fraction from 0 to 1 of the range, not rounded, or of the list."""
-        if self.values is not None:
-            return self.values[min(int(share * len(self.values)), len(self.values) - 1)]
-        least, most = self.ends()
-        if self.scale == "log":
-            return float(math.exp(math.log(least) + share * math.log(most / least)))
-        return least + share * (most - least)
-
     def round_value(self, value: Value) -> Value:
         """Return the value for a design: rounded if it must be an integer."""
         return round(float(value)) if self.whole and self.values is None else value
 
     def values_at(self, shares: np.ndarray) -> list[Value]:
-        """Return the values for designs at fractions (N,), as by `value_at` and `round_value`."""
-        if self.values is not None or self.scale == "log":
-            return [self.round_value(self.value_at(share)) for share in shares.tolist()]
+        """Return the values for designs at fractions (N,) from 0 to 1 of the range or of the list."""
+        if self.values is not None:
+            return [self.values[min(int(share * len(self.values)), len(self.values) - 1)] for share in shares.tolist()]
         least, most = self.ends()
-        values = least + shares * (most - least)
+        values = least * (most / least) ** shares if self.scale == "log" else least + shares * (most - least)
         return np.rint(values).astype(int).tolist() if self.whole else values.tolist()
 
     def grid(self) -> list[Value]:
         """Return all values of a grid."""
         if self.values is not None:
             return list(self.values)
-        return list(dict.fromkeys(self.round_value(self.value_at(k / (self.steps - 1))) for k in range(self.steps)))
+        return list(dict.fromkeys(self.values_at(np.arange(self.steps) / (self.steps - 1))))
 
 
 class Objective(Description):

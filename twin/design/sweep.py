@@ -1,20 +1,18 @@
 """Sweep of a study: evaluate designs by formulas, refine the best, render a few, and write the results.
 
-All files are in one folder, which several machines can share. ``plan.json`` contains the study, ``screen`` the results
-of all evaluated designs in parts, and ``verified`` one file for each rendered design. A stopped sweep can be continued.
+All files are in one folder. ``plan.json`` contains the study, ``screen`` the results of all evaluated designs in parts,
+and ``verified`` one file for each rendered design. A stopped sweep can be continued.
 
-Results are Parquet files in a folder. Each part contains a batch of designs and has the number of its first design in
-its name. Parts are written atomically. Two machines that evaluate the same batch write the same part, so that nothing
-is lost or counted twice. An optimised study gets its designs from NSGA-II (Deb et al. 2002).
+Each part is a Parquet file of a batch of designs, written atomically, and has the number of its first design in its
+name. An optimised study gets its designs from NSGA-II (Deb et al. 2002).
 """
 
 from __future__ import annotations
 
 import csv
 import math
-import random
-import re
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -106,21 +104,16 @@ def read_parts(folder: Path) -> Columns:
                 raise pa.ArrowInvalid("the column 'design' is missing")
             tables.append(table)
         except (pa.ArrowException, OSError, UnicodeDecodeError, KeyError) as error:
-            advice = "remove it and run the sweep again"
-            raise CaptureError(f"{path} is damaged: {error}; {advice}") from error
+            raise CaptureError(f"{path} is damaged: {error}; remove it and run the sweep again") from error
     if not tables:
         return {}
     try:
         table = pa.concat_tables(tables, promote_options="permissive")
     except pa.ArrowException as error:
         raise CaptureError(f"the parts in {folder} are not of one study: {error}") from error
-    columns = _columns(table)
+    columns = {name: table.column(name).to_numpy(zero_copy_only=False) for name in table.column_names}
     _, first = np.unique(columns["design"], return_index=True)
     return {name: column[first] for name, column in columns.items()}
-
-
-def _columns(table: pa.Table) -> Columns:
-    return {name: table.column(name).to_numpy(zero_copy_only=False) for name in table.column_names}
 
 
 def write_csv(path: Path, columns: Columns) -> None:
@@ -129,41 +122,6 @@ def write_csv(path: Path, columns: Columns) -> None:
         writer = csv.writer(file)
         writer.writerow(columns)
         writer.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
-
-
-JOURNAL = "optimiser.log"
-_NAME = "sweep"
-_POPULATION = 64  # designs of a generation of NSGA-II
-
-
-def _open_search(study: Study, folder: Path) -> optuna.Study:
-    """Open the optimiser, with its history in a journal in the study's folder, which several machines can share."""
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
-    journal = JournalStorage(JournalFileBackend(str(folder / JOURNAL)))
-    # Only the first machine uses the seed, so that different machines propose different designs.
-    seed = None if _NAME in optuna.get_all_study_names(journal) else study.sampling.seed
-    return optuna.create_study(
-        storage=journal,
-        sampler=optuna.samplers.NSGAIISampler(population_size=_POPULATION, seed=seed),
-        study_name=_NAME,
-        load_if_exists=True,
-        directions=["minimize" if one.goal == "minimise" else "maximize" for one in study.objectives],
-    )
-
-
-def _report(search: optuna.Study, study: Study, columns: Columns) -> None:
-    """Report the results of designs to the optimiser, except those that were reported before."""
-    trials = {trial.number: trial for trial in search.get_trials(deepcopy=False)}
-    for place, number in enumerate(columns["design"].tolist()):
-        if number not in trials or trials[number].state != TrialState.RUNNING:
-            continue
-        values = [float(columns[objective.figure][place]) for objective in study.objectives]
-        violation = float(columns["violation"][place])
-        if math.isfinite(violation) and all(map(math.isfinite, values)):
-            Trial(search, trials[number]._trial_id).set_constraint("violation", violation)
-            search.tell(number, values)
-        else:
-            search.tell(number, state=TrialState.FAIL)
 
 
 PARTS = "screen"
@@ -199,73 +157,84 @@ def evaluate_study(
     the workers' cluster does not respond.
     """
     make_folder(folder)
-    # Hidden files are temporary files of another machine, running or stopped.
+    # Hidden files are temporary files of a stopped sweep.
     keep_to_plan(folder, _plan(study), set(), recorded="[!.]*", called="files", overwrite=False)
-    place = make_folder(folder / PARTS)
-    if study.sampling.kind == "optimise":
-        _optimise(study, folder, place, workers, progress)
-        return
-    total, size = count_designs(study), study.sampling.batch
-    batches = [Batch(study, None, first, min(size, total - first)) for first in range(0, total, size)]
-    waiting = [batch for batch in batches if count_rows(part_path(place, batch.first)) < batch.count]
-    # Machines work in different orders, and check before each batch whether another machine has done it.
-    random.shuffle(waiting)
-    done = total - sum(batch.count for batch in waiting)
-    progress(done, total)
-
-    def left() -> Iterator[Batch]:
-        nonlocal done
-        for batch in waiting:
-            if count_rows(part_path(place, batch.first)) < batch.count:
-                yield batch
-            else:
-                done += batch.count
+    place, total = make_folder(folder / PARTS), count_designs(study)
 
     def write(evaluated: tuple[Batch, bytes | Lost]) -> None:
         batch, result = evaluated
-        write_part(place, batch.first, _content(batch, result), lost=isinstance(result, Lost))
+        lost = isinstance(result, Lost)
+        if lost:
+            result = encode_part(make_failed_columns(study, batch.all(), [result.reason] * batch.count))
+        write_part(place, batch.first, result, lost=lost)
 
-    # In threads: to flush a part to the disk takes as long as to evaluate one.
-    for (batch, _), _ in map_in_threads(write, workers.map_unordered(evaluate_batch, left())):
-        done += batch.count
+    optimised = study.sampling.kind == "optimise"
+    for done, batches in _propose(study, folder, workers.count) if optimised else [_find_missing(study, place)]:
         progress(done, total)
+        # In threads: to flush a part to the disk takes as long as to evaluate one.
+        for (batch, _), _ in map_in_threads(write, workers.map_unordered(evaluate_batch, batches)):
+            done += batch.count
+            progress(done, total)
 
 
-def _optimise(study: Study, folder: Path, place: Path, workers: Workers, progress: ProgressListener) -> None:
-    """Evaluate the optimiser's designs, one generation at a time, distributed over the workers."""
-    search, free = _open_search(study, folder), study.free()
+def _find_missing(study: Study, place: Path) -> tuple[int, list[Batch]]:
+    """Return the number of evaluated designs of a grid, random or Sobol study, and the batches without a part."""
+    total, size = count_designs(study), study.sampling.batch
+    batches = [Batch(study, None, first, min(size, total - first)) for first in range(0, total, size)]
+    missing = [batch for batch in batches if count_rows(part_path(place, batch.first)) < batch.count]
+    return total - sum(batch.count for batch in missing), missing
+
+
+def _propose(study: Study, folder: Path, workers: int) -> Iterator[tuple[int, list[Batch]]]:
+    """Yield the number of evaluated designs and the optimiser's next ones, a batch for each of the workers.
+
+    The parts are read before each proposal. The optimiser's history is a journal in the folder.
+    """
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    search = optuna.create_study(
+        storage=JournalStorage(JournalFileBackend(str(folder / JOURNAL))),
+        study_name="sweep",
+        load_if_exists=True,
+        directions=["minimize" if one.goal == "minimise" else "maximize" for one in study.objectives],
+    )
+    # With the seed of its beginning, a continued sweep would draw the same random numbers again.
+    seed = study.sampling.seed + len(search.trials)
+    search.sampler = optuna.samplers.NSGAIISampler(population_size=_POPULATION, seed=seed)
+    free = study.free()
     space: dict[str, BaseDistribution] = {
         name: FloatDistribution(*variable.ends(), log=variable.scale == "log")
         if variable.values is None
         else CategoricalDistribution(variable.values)
         for name, variable in free.items()
     }
-    if known := read_parts(place):
-        _report(search, study, known)
-    total = study.sampling.designs
-    # Other machines can add designs, too.
-    while (done := sum(map(count_rows, list_parts(place)))) < total:
-        progress(done, total)
-        trials = [search.ask(space) for _ in range(min(study.sampling.batch, total - done))]
+    while True:
+        columns = read_parts(folder / PARTS)
+        done = len(columns["design"]) if columns else 0
+        _report(search, study, columns)
+        if (left := study.sampling.designs - done) <= 0:
+            return
+        trials = [search.ask(space) for _ in range(min(study.sampling.batch, left))]
         asked = [
             Design(one.number, {name: free[name].round_value(one.params[name]) for name in free}) for one in trials
         ]
-        share = -(-len(asked) // workers.count)
+        share = -(-len(asked) // workers)
         shares = [tuple(asked[i : i + share]) for i in range(0, len(asked), share)]
-        batches = [Batch(study, designs, designs[0].number, len(designs)) for designs in shares]
-        for batch, result in workers.map_unordered(evaluate_batch, batches):
-            content = _content(batch, result)
-            write_part(place, batch.first, content)
-            _report(search, study, _columns(pq.read_table(pa.BufferReader(content))))
-            done += batch.count
-            progress(done, total)
+        yield done, [Batch(study, designs, designs[0].number, len(designs)) for designs in shares]
 
 
-def _content(batch: Batch, result: bytes | Lost) -> bytes:
-    """Return the content of a part; if the worker has died, a placeholder with failed designs and the reason."""
-    if not isinstance(result, Lost):
-        return result
-    return encode_part(make_failed_columns(batch.study, batch.all(), [result.reason] * batch.count))
+def _report(search: optuna.Study, study: Study, columns: Columns) -> None:
+    """Report the results of designs to the optimiser, except those that were reported before."""
+    places = {number: place for place, number in enumerate(columns["design"].tolist())} if columns else {}
+    for trial in search.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
+        if (place := places.get(trial.number)) is None:
+            continue
+        values = [float(columns[objective.figure][place]) for objective in study.objectives]
+        violation = float(columns["violation"][place])
+        if math.isfinite(violation) and all(map(math.isfinite, values)):
+            Trial(search, trial._trial_id).set_constraint("violation", violation)
+            search.tell(trial.number, values)
+        else:
+            search.tell(trial.number, state=TrialState.FAIL)
 
 
 def _plan(study: Study) -> dict[str, JsonValue]:
@@ -275,6 +244,8 @@ def _plan(study: Study) -> dict[str, JsonValue]:
     return plan | {"sensor": study.sensor.model_dump(mode="json")}
 
 
+JOURNAL = "optimiser.log"
+_POPULATION = 64  # designs of a generation of NSGA-II
 RENDERED = "verified"
 PAGE = "report.html"
 TABLE = "designs.csv"
@@ -358,9 +329,8 @@ def sweep(
 ) -> SweepResult:
     """Find the sensor to build: evaluate many designs by formulas, refine the best, and verify some by rendering.
 
-    A stopped sweep continues when it is run again. Several machines can run it on the same folder at the same time. OUT
-    receives report.html, designs.csv, summary.json and the best design as winner.toml, a sensor for twin simulate
-    --sensor.
+    A stopped sweep continues when it is run again. OUT receives report.html, designs.csv, summary.json and the best
+    design as winner.toml, a sensor for twin simulate --sensor.
 
     Parameters
     ----------
@@ -415,20 +385,20 @@ def sweep(
         evaluate_study(described, folder, pool, progress=progress)
         columns = read_parts(folder / PARTS)
         write_csv(folder / TABLE, columns)
-        chosen = choose(described, columns)
-        winner = chosen.marked[-1]
+        marked, further, remarks = choose(described, columns)
+        winner = marked[-1]
         notes = f"{winner.label} of the study: {described.title}"
         sensor = winner.sensor.model_copy(update={"name": f"{winner.sensor.name}-winner", "notes": notes})
         with write_atomically(folder / WINNER, overwrite=True) as aside:
             aside.write_text(tomli_w.dumps(sensor.model_dump(mode="json", exclude_none=True)), encoding="utf-8")
         agreements: list[Agreement] = []
         if described.verify:
-            rendered = [winner, *(one for one in chosen.marked if one.design.number < 0), *chosen.further]
+            rendered = [winner, *(one for one in marked if one.design.number < 0), *further]
             agreements = verify_candidates(
                 described, folder / RENDERED, rendered, pool, variant=variant, progress=progress
             )
-    result = SweepResult(described, folder, columns, chosen.marked, tuple(agreements), chosen.notes)
-    page = page_text(described, columns, marked=chosen.marked, agreements=agreements, notes=chosen.notes)
+    result = SweepResult(described, folder, columns, marked, tuple(agreements), remarks)
+    page = page_text(described, columns, marked=marked, agreements=agreements, notes=remarks)
     write_page(folder / PAGE, page, overwrite=True)
     counts = dict(zip(("designs", "work", "meet_all_constraints"), result.counts(), strict=True))
     content: dict[str, Any] = {"title": described.title} | counts
@@ -444,15 +414,13 @@ def remove_results(folder: Path) -> None:
     """Remove only the files of an earlier sweep from a folder; a folder without a plan is not changed."""
     if not (folder / PLAN).is_file():
         return
-    for pattern in (f"{PARTS}/part-*.parquet", f"{PARTS}/lost-*.parquet", f"{RENDERED}/*.parquet"):
-        for path in folder.glob(pattern):
-            path.unlink()
-    for place in (folder / PARTS, folder / RENDERED, folder):
-        for path in place.glob(".*"):
-            # Temporary files of a sweep that was killed.
-            if path.is_file() and re.fullmatch(r"\.[0-9a-f]{16}\.(parquet|json|csv|toml|html)", path.name):
-                path.unlink()
-        if place != folder and place.is_dir() and not any(place.iterdir()):
-            place.rmdir()
-    for name in (PLAN, JOURNAL, f"{JOURNAL}.lock", PAGE, TABLE, WINNER, SUMMARY):
-        (folder / name).unlink(missing_ok=True)
+    hidden = f".{'[0-9a-f]' * 16}"  # temporary files of a sweep that was killed
+    patterns = [f"{PARTS}/part-*.parquet", f"{PARTS}/lost-*.parquet", f"{RENDERED}/[!.]*.parquet"]
+    patterns += [f"{PARTS}/{hidden}.parquet", f"{RENDERED}/{hidden}.parquet"]
+    patterns += [f"{hidden}.{ending}" for ending in ("json", "csv", "toml", "html")]
+    names = (PLAN, JOURNAL, f"{JOURNAL}.lock", PAGE, TABLE, WINNER, SUMMARY)
+    for path in [path for pattern in (*patterns, *names) for path in folder.glob(pattern)]:
+        path.unlink()
+    for place in (PARTS, RENDERED):
+        with suppress(OSError):  # missing, or it contains other files
+            (folder / place).rmdir()

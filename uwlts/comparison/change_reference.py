@@ -22,7 +22,7 @@ from uwlts.model.sensor import Description, Positive, Vector
 from uwlts.storage.cloud import PointCloud, PointUncertainty, rounding_std_mm
 from uwlts.storage.cloud_files import is_readable_cloud, load_cloud
 from uwlts.storage.mesh_file import has_faces, load_triangles
-from uwlts.storage.number_tables import MM_PER_UNIT, Unit, check_unit
+from uwlts.storage.number_tables import MM_PER_UNIT, Unit
 
 _OPPOSITE = -0.5
 """Largest cosine between the normals of opposite sides: 120 deg, beyond the angle of two faces at an edge."""
@@ -185,7 +185,7 @@ def read_datums(datums: np.ndarray | str | os.PathLike[str]) -> np.ndarray:
 
 def read_reference(reference: Reference, *, unit: Unit | None, disc_mm: float) -> ReferencePoints | IdealShape:
     """Read a reference as points in mm, or as an ideal shape from its name (plane, sphere, cylinder) or TOML file."""
-    scale = MM_PER_UNIT[check_unit(unit or "mm")]
+    scale = MM_PER_UNIT[unit or "mm"]
     if isinstance(reference, str) and reference in KINDS:
         reference = KINDS[reference]
     if isinstance(reference, str | os.PathLike):

@@ -72,11 +72,11 @@ def open_regular(
     Raises ``error`` if the file is missing, unreadable, not regular (a pipe or device would block) or larger than
     ``most_bytes``, or its name is too long or contains a null character. ``called`` names the expected content.
     """
-    cannot = f"cannot read the {called} {_printable_name(path)}"
+    cannot = f"cannot read the {called} {shorten(str(path))}"
     try:
         found = os.stat(path)
     except FileNotFoundError as problem:
-        raise error(f"no {called} at {_printable_name(path)}") from problem
+        raise error(f"no {called} at {shorten(str(path))}") from problem
     except OSError as problem:
         raise error(f"{cannot}: {problem.strerror}") from problem
     except ValueError as problem:
@@ -86,17 +86,12 @@ def open_regular(
         raise error(f"{cannot}: it is {'a directory' if is_folder else 'not a regular file, but a pipe or device'}")
     if most_bytes is not None and found.st_size > most_bytes:
         sizes = f"{found.st_size / MiB:,.1f} MiB; this program reads up to {most_bytes / MiB:,.1f} MiB"
-        raise error(f"the {called} {_printable_name(path)} has {sizes}")
+        raise error(f"the {called} {shorten(str(path))} has {sizes}")
     try:
         with open(path, "rb") as file:
             yield file
     except OSError as problem:
         raise error(f"{cannot}: {problem.strerror or problem}") from problem
-
-
-def _printable_name(path: str | Path) -> str:
-    """Return a name for messages: printable, and not longer than a line."""
-    return shorten(make_printable(str(path)))
 
 
 def shorten(text: str, most: int = 300) -> str:
@@ -127,7 +122,7 @@ def read_bytes(path: str | Path, *, most_bytes: int, error: type[Error] = Captur
         while len(content) <= most_bytes and (more := file.read(MiB)):
             content += more
     if len(content) > most_bytes:
-        raise error(f"the {called} {_printable_name(path)} has more than {most_bytes / MiB:,.1f} MiB")
+        raise error(f"the {called} {shorten(str(path))} has more than {most_bytes / MiB:,.1f} MiB")
     return content
 
 
@@ -151,7 +146,7 @@ def read_text(
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as problem:
         kind = next((kind for mark, kind in _FOREIGN.items() if content.startswith(mark)), "no text in UTF-8")
-        raise error(f"{_printable_name(path)} {foreign or f'is not {add_article(called)}'}: it is {kind}") from problem
+        raise error(f"{shorten(str(path))} {foreign or f'is not {add_article(called)}'}: it is {kind}") from problem
 
 
 def add_article(called: str) -> str:

@@ -29,12 +29,16 @@ _RETURNING_ROUNDS = 20  # rounds after which rejected points no longer return, s
 
 
 class Fit(Protocol):
-    """Fitted shape as required by `fit_robustly`."""
+    """Fitted shape of `uwlts.shapes` with the derivatives of its distances."""
 
     @property
     def residuals_mm(self) -> np.ndarray: ...
 
     def distances_mm(self, points: np.ndarray) -> np.ndarray: ...
+
+    def normals_at(self, points: np.ndarray) -> np.ndarray: ...
+
+    def derivatives(self, points: np.ndarray) -> np.ndarray: ...
 
 
 FitT = TypeVar("FitT", bound=Fit)

@@ -181,7 +181,7 @@ def _fit_patches(
     variance,
 ):
     """Fill heights (P,), normals (P, 3), ``found`` (P,), and variances (P, 2) by noise and by systematic errors."""
-    by = np.empty(_TERMS)
+    by = np.empty(_TERMS + 1)
     for number in range(len(places)):
         place = places[number]
         nearest, least = -1, radius * radius
@@ -212,9 +212,8 @@ def _fit_patches(
                     total += share
                     left_u += share * by[1] * radius
                     left_v += share * by[2] * radius
-                    up = _height_above(points[k], place, normal)
                     for i in range(_TERMS):
-                        right[i] += share * by[i] * up
+                        right[i] += share * by[i] * by[_TERMS]
                         for j in range(_TERMS):
                             matrix[i, j] += share * by[i] * by[j]
         if count < _FEWEST:
@@ -235,9 +234,9 @@ def _fit_patches(
                 if kernel <= 0:
                     continue
                 share = kernel * weight[k]
-                part = share * np.sum(answer * by)
+                part = share * np.sum(answer * by[:_TERMS])
                 square += part * part
-                residual = _height_above(points[k], place, normal) - np.sum(coefficients * by)
+                residual = by[_TERMS] - np.sum(coefficients * by[:_TERMS])
                 scatter += share * residual * residual
                 freedom += share
                 single += part * part * noise[k]
@@ -265,24 +264,18 @@ def _fit_patches(
 
 
 @compiled
-def _height_above(point, place, normal):
-    """Return the height of a point above a place along the normal."""
-    return (point[0] - place[0]) * normal[0] + (point[1] - place[1]) * normal[1] + (point[2] - place[2]) * normal[2]
-
-
-@compiled
 def _fill_terms(point, place, normal, first, second, own, radius, by):
-    """Fill the terms (6,) 1, u, v, u^2, u v, v^2 of a point (unit: radius) and return its kernel weight."""
+    """Fill 1, u, v, u^2, u v, v^2 of a point (unit: radius) and its height (7,); return its kernel weight."""
     if own[0] * normal[0] + own[1] * normal[1] + own[2] * normal[2] < _SAME_SIDE:
         return 0.0
     a, b, c = point[0] - place[0], point[1] - place[1], point[2] - place[2]
     u = (a * first[0] + b * first[1] + c * first[2]) / radius
     v = (a * second[0] + b * second[1] + c * second[2]) / radius
-    up = (a * normal[0] + b * normal[1] + c * normal[2]) / radius
+    up = a * normal[0] + b * normal[1] + c * normal[2]
     across = u * u + v * v
-    if across >= 1.0 or abs(up) > 1.0:
+    if across >= 1.0 or abs(up / radius) > 1.0:
         return 0.0
-    by[0], by[1], by[2], by[3], by[4], by[5] = 1.0, u, v, u * u, u * v, v * v
+    by[0], by[1], by[2], by[3], by[4], by[5], by[6] = 1.0, u, v, u * u, u * v, v * v, up
     return (1.0 - across) ** 2
 
 

@@ -1,8 +1,7 @@
 """Selection of the next observation by the reduction of the uncertainty of given functions of the parameters.
 
 Each candidate adds information (inverse covariance) to what is known, so that its effect follows before it is recorded
-(Atkinson, Donev and Tobias, Optimum Experimental Designs, 2007). The same covariance shows which combinations of the
-parameters leave the functions uncertain.
+(Atkinson, Donev and Tobias, Optimum Experimental Designs, 2007).
 """
 
 from collections.abc import Callable, Iterable
@@ -14,11 +13,6 @@ import numpy as np
 _LEAST_EIGENVALUE = 1e-15
 """Smallest eigenvalue of information with a unit diagonal, relative to the largest: less is a rounding error."""
 _HELPFUL = 0.95  # ratio to the previous uncertainty; less than a twentieth is not an improvement
-_MOST = 3  # largest number of parameters or directions to list
-_LEAST_SHARE = 0.1  # fraction of the variance of all functions; a direction with less is not listed
-_NAMED_SHARE = 0.4  # fraction of the most important parameter's contribution; others are not listed with it
-_CAUSE_SHARE = 0.3  # fraction of a direction that knowledge of one parameter must determine to count as its cause
-_CONFUSED = 0.3  # smallest correlation eigenvalue below which parameters are inseparable: correlation of 0.7 for two
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,58 +56,16 @@ class CovarianceRoot:
         return np.linalg.norm(functions @ self.root, axis=1)
 
 
-@dataclass(frozen=True, eq=False)
-class WeakDirection:
-    """Independent change of the parameters by one standard deviation.
-
-    ``changes`` (M,) are those of the functions. ``parameters`` are the numbers of the main parameters, the most
-    important first; ``confused`` says whether they are too correlated to be separated.
-    """
-
-    changes: np.ndarray
-    parameters: list[int]
-    confused: bool
-
-
-def find_weak_directions(covariance: np.ndarray, functions: np.ndarray, *, least: float = 0.0) -> list[WeakDirection]:
-    """Return at most three directions with the largest changes of functions, the weakest first.
-
-    ``covariance`` is (P, P), ``functions`` (M, P) contains derivatives. A direction that adds less than a tenth of the
-    variance of all functions, or changes none by ``least``, is omitted.
-    """
-    root, std, found = CovarianceRoot.from_covariance(covariance).root, np.sqrt(np.diag(covariance)), []
-    _, sizes, parts = np.linalg.svd(functions @ root, full_matrices=False)
-    for size, part in zip(sizes[:_MOST], parts, strict=False):
-        direction = root @ part
-        changes = functions @ direction
-        if size**2 < _LEAST_SHARE * np.sum(sizes**2) or np.abs(changes).max() < least:
-            break
-        named = _select_main_parameters(functions, direction, std)
-        correlation = covariance[np.ix_(named, named)] / np.outer(std[named], std[named])
-        confused = len(named) > 1 and bool(np.linalg.eigvalsh(correlation)[0] < _CONFUSED)
-        found.append(WeakDirection(changes, named, confused))
-    return found
-
-
-def _select_main_parameters(functions: np.ndarray, direction: np.ndarray, std: np.ndarray) -> list[int]:
-    """Return the numbers of at most three main parameters of a direction (P,), the most important first.
-
-    The squared correlation of a parameter with the direction is the fraction of its variance that knowledge of the
-    parameter would remove. This includes parameters without an effect, such as a step height on lengths. If no single
-    parameter would help, the parameters with the largest effect on the functions are returned.
-    """
-    share = np.divide(direction**2, std**2, out=np.zeros_like(std), where=std > 0)
-    if share.max() < _CAUSE_SHARE:
-        share = np.linalg.norm(functions, axis=0) * np.abs(direction)
-    return [int(place) for place in np.argsort(-share) if share[place] >= _NAMED_SHARE * share.max()][:_MOST]
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Candidate:
-    """Observation that may be made next, as text, and the information (P, P) that it adds to the parameters."""
+    """Observation that may be made next, as text, and the information (P, P) that it adds to the parameters.
+
+    ``pose`` (4, 4) is that of the object to observe, or of what carries the sensor.
+    """
 
     words: str = ""
     information: np.ndarray
+    pose: np.ndarray
 
 
 AnyCandidate = TypeVar("AnyCandidate", bound=Candidate)

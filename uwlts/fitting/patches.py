@@ -103,23 +103,9 @@ class Patches:
 
     def __getitem__(self, selection: Any) -> Patches:
         """Select patches by a slice, indices or a mask."""
-        return Patches(
-            self.places_mm[selection],
-            self.axes[selection],
-            self.shape[selection],
-            self.covariance[selection],
-            self.patterns_mm[:, selection],
-            self.numbers[selection],
-            self.radius_mm,
-            self.averages,
-            self.errors[selection],
-            self.image_variance_mm2[selection],
-            self.one_sided,
-            self.noise_stated,
-            self.shared,
-            self.overlap,
-            self.strips,
-        )
+        of_each = ("places_mm", "axes", "shape", "covariance", "numbers", "errors", "image_variance_mm2")
+        some = {name: getattr(self, name)[selection] for name in of_each}
+        return replace(self, patterns_mm=self.patterns_mm[:, selection], **some)
 
 
 def surface_patches(
@@ -142,8 +128,8 @@ def surface_patches(
     if len(points_mm) < 10 * _FEWEST:
         raise EvaluationError(f"the cloud has {len(points_mm)} points; at least {10 * _FEWEST} are needed")
     radius = radius_mm or find_disc_radius(points_mm)
-    owner, means, counts = _average_in_cubes(points_mm, radius / _CELLS_PER_RADIUS)
-    averages = Averages(means, counts, _average_patterns(uncertainty, owner, counts))
+    averages, owner, first = _average_in_cubes(points_mm, radius / _CELLS_PER_RADIUS, uncertainty)
+    means, counts = averages.places_mm, averages.counts
     middle = _select_central(means, radius)
     discs = _gather_discs(averages, means[middle], radius)
     enough = discs.held.sum(axis=1) >= _FEWEST
@@ -154,7 +140,7 @@ def surface_patches(
     fit = _fit_discs(discs, axes, radius)
     variance = fit.point_variance
     kept = variance <= _ROUGH**2 * max(np.median(variance), 1e-30)
-    first, grouped = _first_points(owner), frame is not None and bool(np.any(frame >= 0))
+    grouped = frame is not None and bool(np.any(frame >= 0))
     variance = noise = np.maximum(variance, np.median(variance))
     if uncertainty is not None:
         known = uncertainty[first[middle]]
@@ -212,9 +198,10 @@ class _Discs:
 
 def _gather_discs(averages: Averages, middles_mm: np.ndarray, radius: float) -> _Discs:
     """Find the averages in discs about middles (P, 3)."""
-    away, near = _nearest_within(averages.tree, middles_mm, radius)
-    held = np.isfinite(away)
-    near = np.where(held, near, 0)
+    tree = averages.tree
+    found: Any = tree.query(middles_mm, k=min(_NEIGHBOURS, tree.n), distance_upper_bound=radius)
+    held = np.isfinite(found[0])
+    near = np.where(held, found[1], 0)
     about = averages.places_mm[near] - middles_mm[:, None]
     return _Discs(near, held, about, np.where(held, averages.counts[near], 0.0))
 
@@ -263,13 +250,11 @@ def find_disc_radius(points_mm: np.ndarray) -> float:
     if radius == 0:
         raise EvaluationError("most points have six others at the same place: omit repeated points")
     while radius < _LARGEST_PATCH * size:
-        means = _average_in_cubes(points_mm, radius / _CELLS_PER_RADIUS)[1]
-        away, near = _nearest_within(KDTree(means), means[:: max(1, len(means) // _SAMPLE)], radius)
-        held = np.isfinite(away)
-        near = np.where(held, near, 0)
-        about = means[near] - means[near[:, 0]][:, None]
-        spread = np.linalg.eigvalsh(np.einsum("pk,pki,pkj->pij", 1.0 * held, about, about))
-        enough = held.sum(axis=1) >= 2 * _FEWEST
+        averages, *_ = _average_in_cubes(points_mm, radius / _CELLS_PER_RADIUS)
+        step = max(1, len(averages.counts) // _SAMPLE)
+        discs = _gather_discs(averages, averages.places_mm[::step], radius)
+        spread = np.linalg.eigvalsh(np.einsum("pk,pki,pkj->pij", 1.0 * discs.held, discs.about_mm, discs.about_mm))
+        enough = discs.held.sum(axis=1) >= 2 * _FEWEST
         round_ = spread[:, 1] > _ROUND * spread[:, 2]
         if np.mean(enough & round_) > 0.6:
             return radius
@@ -356,14 +341,11 @@ def refit_distances(found: PatchDistances, source: Patches, target: Patches, tar
     height is less certain than a single point are omitted.
     """
     rotation, radius = target_pose[:3, :3], target.radius_mm
-
-    def gather(found: PatchDistances) -> tuple[np.ndarray, np.ndarray, _Discs]:
-        places = (found.places_mm - target_pose[:3, 3]) @ rotation
-        feet = places - found.distance_mm[:, None] * (found.normals @ rotation)
-        return places, feet, _gather_discs(target.averages, feet, radius)
-
-    found = found[gather(found)[2].held.sum(axis=1) >= _FEWEST]
-    places, feet, discs = gather(found)
+    places = (found.places_mm - target_pose[:3, 3]) @ rotation
+    feet = places - found.distance_mm[:, None] * (found.normals @ rotation)
+    discs = _gather_discs(target.averages, feet, radius)
+    enough = discs.held.sum(axis=1) >= _FEWEST
+    found, places, feet, discs = found[enough], places[enough], feet[enough], discs[enough]
     axes = target.axes[found.target]
     fit = _fit_discs(discs, axes, radius)
     slopes = fit.shape[:, 1:3]
@@ -433,12 +415,16 @@ def _columns(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
 
 
-def _average_in_cubes(points: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Average points in cubes; return the cube (N,) of each point, and means (C, 3) and counts (C,) of the cubes."""
+def _average_in_cubes(
+    points: np.ndarray, cell: float, uncertainty: PointUncertainty | None = None
+) -> tuple[Averages, np.ndarray, np.ndarray]:
+    """Average points in cubes; return also the cube (N,) of each point, and the first point (C,) of each cube."""
     keys = number_cubes(points - points.min(axis=0), cell)
-    _, owner, counts = np.unique(keys, return_inverse=True, return_counts=True)
-    means = np.stack([np.bincount(owner, column) for column in points.T], axis=1) / counts[:, None]
-    return owner, means, counts.astype(np.float64)
+    _, first, owner, counts = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
+    vectors = (points, *(() if uncertainty is None else uncertainty.patterns_mm))
+    means = [np.stack([np.bincount(owner, c) for c in each.T], axis=1) / counts[:, None] for each in vectors]
+    patterns = np.reshape(means[1:], (-1, len(counts), 3))
+    return Averages(means[0], counts.astype(np.float64), patterns), owner, first
 
 
 def _select_central(points: np.ndarray, apart: float) -> np.ndarray:
@@ -449,11 +435,6 @@ def _select_central(points: np.ndarray, apart: float) -> np.ndarray:
     order = np.lexsort((off, *cells.T))
     changed = np.any(np.diff(cells[order], axis=0), axis=1)
     return np.sort(order[np.r_[True, changed]])
-
-
-def _nearest_within(tree: KDTree, places: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    found: Any = tree.query(places, k=min(_NEIGHBOURS, tree.n), distance_upper_bound=radius)
-    return found
 
 
 def _principal_frames(about: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -481,13 +462,6 @@ def _level(places: np.ndarray, axes: np.ndarray, shape: np.ndarray) -> tuple[np.
     return moved, np.stack([first, np.cross(normal, first), normal], axis=1), level
 
 
-def _first_points(owner: np.ndarray) -> np.ndarray:
-    """Return the number of the first point in each cube, from the cubes (N,) of the points."""
-    first = np.zeros(int(owner.max()) + 1, np.int64)
-    first[owner[::-1]] = np.arange(len(owner))[::-1]
-    return first
-
-
 def _image_errors(
     known: PointUncertainty | None, frame: np.ndarray | None, owner: np.ndarray, first: np.ndarray
 ) -> tuple[csr_array, np.ndarray]:
@@ -498,14 +472,3 @@ def _image_errors(
     numbers = np.unique(frame, return_inverse=True)[1].ravel()
     shares = csr_array((1 / np.bincount(owner)[owner], (owner, numbers)))
     return shares, shifts[shifts.any(axis=(1, 2))].astype(np.float64)
-
-
-def _average_patterns(known: PointUncertainty | None, owner: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return the systematic patterns (M, C, 3) of averages."""
-    if known is None:
-        return np.zeros((0, len(counts), 3))
-    patterns = np.zeros((len(known.patterns_mm), len(counts), 3))
-    for number, pattern in enumerate(known.patterns_mm):
-        for axis, column in enumerate(pattern.T):
-            patterns[number, :, axis] = np.bincount(owner, column) / counts
-    return patterns

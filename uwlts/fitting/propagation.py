@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic
 
 import numpy as np
 
+from uwlts.fitting.least_squares import FitT
 from uwlts.storage.cloud import PointCloud, PointUncertainty, expand_covariances, project_image_errors, project_variance
 
 _SEED = 635  # seed of the draws, so that a cloud always has the same uncertainties
@@ -162,28 +163,14 @@ def differences(values: Callable[[np.ndarray], np.ndarray], at: np.ndarray, step
     return np.stack(np.broadcast_arrays(*columns), axis=1)
 
 
-class FittedShape(Protocol):
-    """Fitted shape of `uwlts.shapes` with the derivatives of its distances."""
-
-    @property
-    def residuals_mm(self) -> np.ndarray: ...
-
-    def normals_at(self, points: np.ndarray) -> np.ndarray: ...
-
-    def derivatives(self, points: np.ndarray) -> np.ndarray: ...
-
-
-ShapeT = TypeVar("ShapeT", bound=FittedShape)
-
-
-class LinearisedFit(Generic[ShapeT]):
+class LinearisedFit(Generic[FitT]):
     """Linearised fit of a shape to the ``used`` (K,) of points (N, 3).
 
     A point's shift along the normal changes its distance from the shape. Normals and the distances' derivatives by the
     shape's parameters are constant, since shifts are small compared with the shape.
     """
 
-    def __init__(self, shape: ShapeT, points: np.ndarray, used: np.ndarray):
+    def __init__(self, shape: FitT, points: np.ndarray, used: np.ndarray):
         self.used, self.shape, self._outward = used, shape, shape.normals_at(points[used])
         self._design = -shape.derivatives(points[used])
         self._solve = np.linalg.solve(self._design.T @ self._design, self._design.T)

@@ -153,6 +153,39 @@ def schur_least_squares(
     )
 
 
+def normal_equations(
+    parts: Sequence[Observation | LocalPrior], count: int, size: int, *, soft_limit: float | None = None
+) -> tuple[np.ndarray, float]:
+    """Return the normal equations of a group, and the cost of its residuals.
+
+    The matrix (count + size + 1, count + size + 1) contains the products of the derivatives by ``count`` global and
+    ``size`` local parameters and, in the last column, with the residuals.
+    """
+    product, cost = np.zeros((count + size + 1,) * 2), 0.0
+    for part in parts:
+        squares, weight = np.sum(part.residuals**2, axis=1), None
+        if soft_limit is None:
+            cost += float(squares.sum())
+        else:
+            root = np.sqrt(1 + squares / soft_limit**2)
+            cost += float(np.sum(2 * soft_limit**2 * (root - 1)))
+            weight = np.repeat(np.sqrt(root), part.residuals.shape[1])[:, None]
+        if isinstance(part, LocalPrior):
+            by_local, off = part.by_local, part.residuals
+            if weight is not None:
+                by_local, off = by_local.multiply(1 / weight).tocsr(), off / weight
+            product[count:-1, count:-1] += (by_local.T @ by_local).toarray()
+            product[count:-1, -1:] += by_local.T @ off
+            continue
+        columns = np.hstack([part.by_global, part.by_local, part.residuals.reshape(-1, 1)])
+        if weight is not None:
+            columns /= weight
+        places = np.arange(size) if part.local_columns is None else part.local_columns
+        at = np.r_[0:count, count + places, count + size]
+        product[np.ix_(at, at)] += columns.T @ columns
+    return product, cost
+
+
 def _assemble(
     model: Model, global_values: np.ndarray, local: list[np.ndarray], soft_limit: float | None
 ) -> _Normal | None:
@@ -162,30 +195,10 @@ def _assemble(
         if parts is None:
             return None
         parts = [parts] if isinstance(parts, Observation) else parts
-        product = np.zeros((count + len(values) + 1,) * 2)
-        for part in parts:
-            if not np.isfinite(part.residuals).all():
-                return None
-            squares, weight = np.sum(part.residuals**2, axis=1), None
-            if soft_limit is None:
-                cost += float(squares.sum())
-            else:
-                root = np.sqrt(1 + squares / soft_limit**2)
-                cost += float(np.sum(2 * soft_limit**2 * (root - 1)))
-                weight = np.repeat(np.sqrt(root), part.residuals.shape[1])[:, None]
-            if isinstance(part, LocalPrior):
-                by_local, off = part.by_local, part.residuals
-                if weight is not None:
-                    by_local, off = by_local.multiply(1 / weight).tocsr(), off / weight
-                product[count:-1, count:-1] += (by_local.T @ by_local).toarray()
-                product[count:-1, -1:] += by_local.T @ off
-                continue
-            columns = np.hstack([part.by_global, part.by_local, part.residuals.reshape(-1, 1)])
-            if weight is not None:
-                columns /= weight
-            places = np.arange(len(values)) if part.local_columns is None else part.local_columns
-            at = np.r_[0:count, count + places, count + len(values)]
-            product[np.ix_(at, at)] += columns.T @ columns
+        if not all(np.isfinite(part.residuals).all() for part in parts):
+            return None
+        product, own_cost = normal_equations(parts, count, len(values), soft_limit=soft_limit)
+        cost += own_cost
         found.append((np.vstack([part.residuals for part in parts]), product))
     global_scale = _column_lengths(sum((np.diag(product)[:count] for _, product in found), np.zeros(count)))
     block, gradient, groups = np.zeros((count, count)), np.zeros(count), []

@@ -1,7 +1,7 @@
 """The next pass: a motion of the sensor relative to the scene, and the uncertainty of lengths that it would leave."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,11 +20,8 @@ _LEAST_OVERLAP = 0.3
 """Smallest fraction of the cells that a candidate must see, so that poses and surface stay connected."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
 class NextPass(Candidate):
-    """A further pass with its pose (4, 4) in the common frame."""
-
-    pose: np.ndarray
+    """A further pass; its pose is in the common frame."""
 
 
 def rank_passes(problem: PassProblem, solution: PassSolution, lengths: np.ndarray) -> list[Forecast[NextPass]]:
@@ -48,11 +45,8 @@ def _candidates(problem: PassProblem, solution: PassSolution) -> Iterator[NextPa
         placed, there = seen
         count = problem.unknowns
         by = np.einsum("ni,niu->nu", normals[there], placed)
-        added = np.zeros((len(by), len(by[0])))
-        added[:, : problem.of_sensor] = by[:, : problem.of_sensor]
-        added[:, count:] = by[:, count:]
-        added[:, :count] -= rows[there]
-        information = (added.T / (1 / each[there] + 1 / weight[there]) / solution.spread**2) @ added
+        by[:, :count] -= rows[there]
+        information = (by.T / (1 / each[there] + 1 / weight[there]) / solution.spread**2) @ by
         information[count:, count:] += np.eye(len(information) - count)
         yield NextPass(words=words, information=eliminate_others(information, count), pose=pose)
 

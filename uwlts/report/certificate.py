@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import JsonValue, PlainSerializer
 
 from uwlts._version import __version__
-from uwlts.calibration.joint.next_shot import WHOLE_VOLUME, CandidateShot, rank_next_shots
+from uwlts.calibration.joint.next_shot import WHOLE_VOLUME, rank_next_shots
 from uwlts.calibration.joint.observability import (
     Weakness,
     compute_mesh_lengths,
@@ -20,7 +20,7 @@ from uwlts.calibration.joint.stored_estimate import require_joint
 from uwlts.errors import CaptureError
 from uwlts.files.json_files import SEAL, compute_seal, read_json
 from uwlts.files.writing import hash_file
-from uwlts.fitting.next_observation import Forecast
+from uwlts.fitting.next_observation import Candidate, Forecast
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration
 from uwlts.model.joint_estimate import ImageFit
@@ -323,7 +323,7 @@ def _complete_joint(base: Certificate, calibration: Calibration) -> JointCertifi
     )
 
 
-def _shots(forecasts: Sequence[Forecast[CandidateShot]]) -> tuple[NextShot, ...]:
+def _shots(forecasts: Sequence[Forecast[Candidate]]) -> tuple[NextShot, ...]:
     """Return the best shots, and the best of each kind, in order."""
     kinds = [each.candidate.words.split(",")[0] for each in forecasts]
     return tuple(

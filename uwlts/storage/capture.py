@@ -249,13 +249,13 @@ class Capture(AbstractContextManager["Capture"]):
         self.stage_mm, self.pose, self.laser_on, self.exposure_ms, self.time_s = (
             read_values(columns[name], slice(self._count)) for name in PER_FRAME
         )
-        if not (np.isfinite(self.speed_mm_per_s).all() and np.isfinite(self.stage_reports).all()):
-            raise CaptureError(f"{self.path} holds speeds or reports of the stage that are not finite")
-        if not all(np.isfinite(values).all() for values in (self.stage_mm, self.exposure_ms, self.time_s)):
-            raise CaptureError(f"{self.path} holds stage positions, exposures or times that are not finite")
-        if (self.exposure_ms < 0).any():
-            raise CaptureError(f"{self.path} holds negative exposures")
-        self.pose_covariance = self._checked_poses()
+        for numbers, called in (
+            ((self.speed_mm_per_s, self.stage_reports), "speeds or reports of the stage"),
+            ((self.stage_mm, self.exposure_ms, self.time_s), "stage positions, exposures or times"),
+        ):
+            if not all(np.isfinite(values).all() for values in numbers):
+                raise CaptureError(f"{self.path} holds {called} that are not finite")
+        self.pose_covariance = self._check_poses()
         if unfinished and self._count > 1 and self.time_s[-1] < self.time_s[-2]:
             # The writer was killed between extending the datasets and storing its last frame.
             self._count -= 1
@@ -264,8 +264,10 @@ class Capture(AbstractContextManager["Capture"]):
         if (np.diff(self.time_s) < 0).any():
             raise CaptureError(f"{self.path} holds times that decrease")
 
-    def _checked_poses(self) -> np.ndarray | None:
-        """Check the poses, and return their covariances if the file has them."""
+    def _check_poses(self) -> np.ndarray | None:
+        """Check exposures and poses, and return the covariances of the poses if the file has them."""
+        if (self.exposure_ms < 0).any():
+            raise CaptureError(f"{self.path} holds negative exposures")
         finite = np.isfinite(self.pose).reshape(self._count, 16)
         if (finite.any(axis=1) != finite.all(axis=1)).any():
             raise CaptureError(f"{self.path} holds poses with only some of their elements")

@@ -194,15 +194,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         OutputError
             Writing fails; earlier frames are kept.
         """
-        seen = frame.seen
-        if isinstance(seen, Stripe):
-            if len(seen.centre_px) != self._lines:
-                held = f"centre lines of {self._lines} profile lines" if self._lines else "images"
-                raise ImageError(f"frame is a centre line of {len(seen.centre_px)} lines, the capture holds {held}")
-        elif seen.shape != self._shape or seen.dtype != self._dtype:
-            raise ImageError(f"frame is {seen.shape} {seen.dtype}, the capture holds {self._shape} {self._dtype}")
-        elif self._lines and frame.laser_on:
-            raise ImageError("frame is an image with the laser on, the capture holds centre lines for these")
+        self._require_fitting(frame)
         if frame.speed_mm_per_s and not self._moving:
             raise CaptureError(f"a frame moves by {frame.speed_mm_per_s:g} mm/s in a capture of a stage at rest")
         if not np.isfinite([frame.stage_mm, frame.exposure_ms, frame.time_s]).all() or frame.exposure_ms < 0:
@@ -237,6 +229,17 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
                 dataset.resize(len(values), axis=0)
                 dataset[...] = values
                 dataset.flush()
+
+    def _require_fitting(self, frame: Frame) -> None:
+        seen = frame.seen
+        if isinstance(seen, Stripe):
+            if len(seen.centre_px) != self._lines:
+                held = f"centre lines of {self._lines} profile lines" if self._lines else "images"
+                raise ImageError(f"frame is a centre line of {len(seen.centre_px)} lines, the capture holds {held}")
+        elif seen.shape != self._shape or seen.dtype != self._dtype:
+            raise ImageError(f"frame is {seen.shape} {seen.dtype}, the capture holds {self._shape} {self._dtype}")
+        elif self._lines and frame.laser_on:
+            raise ImageError("frame is an image with the laser on, the capture holds centre lines for these")
 
     def _store(self, frame: Frame) -> None:
         self._claim_space()

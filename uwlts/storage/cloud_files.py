@@ -399,10 +399,13 @@ def _read_uncertainty(names: Mapping[str, str], column: Callable[[str], np.ndarr
 def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     try:
         whole, comments = read_ply(path, "vertex", called="cloud")
-    except OSError as error:
-        raise CaptureError(f"{path} cannot be read: {error.strerror or error}") from error
-    except MemoryError as error:
-        raise CaptureError(f"{path} does not fit into the memory") from error
+    except (OSError, MemoryError) as error:
+        reason = (
+            f"cannot be read: {error.strerror or error}"
+            if isinstance(error, OSError)
+            else "does not fit into the memory"
+        )
+        raise CaptureError(f"{path} {reason}") from error
     if whole is None:
         raise CaptureError(f"{path} is a PLY file without vertices; expected an element 'vertex'")
     vertices, names = whole[rows(len(whole))], whole.dtype.names or ()

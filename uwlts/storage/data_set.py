@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -134,7 +134,6 @@ def _decode(ending: str, content: bytes) -> Any:
 
 
 Split = Literal["train", "validation", "test"]
-SPLITS: tuple[Split, ...] = get_args(Split)
 CARD = "dataset.json"
 CARD_FORMAT = "uwlts-dataset"
 CARD_VERSION = 2  # of the file format
@@ -235,7 +234,7 @@ def load_dataset(folder: str | Path, *, split: Split | None = None, names: Seque
     CaptureError
         The folder does not contain a complete data set; or, when samples are read, a file is damaged.
     DescriptionError
-        The split or a name is unknown.
+        A name is unknown.
 
     Examples
     --------
@@ -244,8 +243,6 @@ def load_dataset(folder: str | Path, *, split: Split | None = None, names: Seque
     >>> sample["image"].shape, sample["centre_px"].shape
     """
     folder = Path(folder)
-    if split is not None and split not in SPLITS:
-        raise DescriptionError(f"unknown split '{split}'; known are {', '.join(SPLITS)}")
     card_file = folder / CARD
     try:
         card = read_model(

@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 
 import h5py
 import numpy as np
+from h5py._objects import phil
 from pydantic import JsonValue
 
 from uwlts.errors import CaptureError, Error
@@ -225,10 +226,9 @@ def has_writer(path: str | Path) -> bool:
 def open_unfinished(path: str | Path) -> h5py.File:
     """Open a file that is being written, or whose writer was killed, as last flushed; raises like ``h5py.File``."""
     access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
-    access.set_fclose_degree(h5py.h5f.CLOSE_STRONG)
     access.set_file_locking(False, True)
-    # h5py has no function for this setting; its module is linked with the library.
-    with suppress(AttributeError):
+    # h5py has no function for this setting; its module is linked with the library, which only one thread may call.
+    with suppress(AttributeError), phil:
         set_attempts = ctypes.CDLL(h5py.h5p.__file__).H5Pset_metadata_read_attempts
         set_attempts(ctypes.c_int64(access.id), ctypes.c_uint(_ATTEMPTS))
     mode = h5py.h5f.ACC_RDONLY | h5py.h5f.ACC_SWMR_READ

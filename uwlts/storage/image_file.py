@@ -60,7 +60,13 @@ def read_header(content: bytes, path: str | Path) -> ImageHeader:
         found = "it is empty" if not content else f"it begins with {content[:8]!r}"
         raise ImageError(f"{path} is no PNG, TIFF, BMP or JPEG image: {found}; leave it out or convert it")
     try:
-        found = _tiff_header(content) if kind == "TIFF" else _open_header(content, kind)
+        if kind == "TIFF":
+            found = _tiff_header(content)
+        else:
+            with Image.open(io.BytesIO(content), formats=[kind, "MPO"]) as image:
+                found = ImageHeader(kind, *image.size)
+                if kind == "PNG":
+                    image.verify()
     except Image.DecompressionBombError as error:
         raise ImageError(f"{path}: {error}") from error
     except Exception as error:  # Pillow raises exceptions of many types for damaged files.
@@ -73,14 +79,6 @@ def read_header(content: bytes, path: str | Path) -> ImageHeader:
             f"{path} declares {found.width_px} x {found.height_px} pixels; this program reads images of up to "
             f"{MOST_PIXELS / 1e6:g} million"
         )
-    return found
-
-
-def _open_header(content: bytes, kind: str) -> ImageHeader:
-    with Image.open(io.BytesIO(content), formats=[kind, "MPO"]) as image:
-        found = ImageHeader(kind, *image.size)
-        if kind == "PNG":
-            image.verify()
     return found
 
 

@@ -88,16 +88,16 @@ def read_mount_evidence(
     ``options`` are the given ones of `MountOptions`. Times (N,) belong to arrays. Raises DescriptionError if profiles
     and poses do not match, or one of them is not valid.
     """
-    digests: dict[str, str] = {}
+    given = [Path(each) for each in (profiles, poses) if isinstance(each, str | Path)]
     names: list[str] | None = None
     chosen = validate_description(MountOptions, options, "what is given")
     if poses is None:
         raise DescriptionError("the poses are missing: give T_base_platform of every profile")
     if isinstance(profiles, str | Path):
-        names, profiles, times = read_profiles(profiles, unit=chosen.profile_unit, digests=digests)
+        names, profiles, times = read_profiles(profiles, unit=chosen.profile_unit)
         profile_times_s = times if profile_times_s is None else profile_times_s
     if isinstance(poses, str | Path):
-        poses, times = read_poses(poses, pose_format=chosen.pose_format, unit=chosen.pose_unit, digests=digests)
+        poses, times = read_poses(poses, pose_format=chosen.pose_format, unit=chosen.pose_unit)
         pose_times_s = times if pose_times_s is None else pose_times_s
     checked = [_checked_profile(profile, number) for number, profile in enumerate(profiles)]
     matrices = check_matrices(np.asarray(poses, dtype=np.float64), "poses")
@@ -106,7 +106,7 @@ def read_mount_evidence(
             raise DescriptionError(
                 "from profiles, the axis of a rotary table is found with a sphere on it, without a scale"
             )
-        require_table(matrices, axis=chosen.axis)
+        require_table(matrices)
     if chosen.time and (profile_times_s is None or pose_times_s is None):
         raise DescriptionError("a time offset needs the times of profiles and poses: give both a column time_s")
     if profile_times_s is not None and pose_times_s is not None and (chosen.time or len(matrices) != len(checked)):
@@ -127,7 +127,7 @@ def read_mount_evidence(
         names=names or [str(number + 1) for number in range(len(checked))],
         profile_times_s=profile_times_s,
         pose_times_s=pose_times_s,
-        digests=digests,
+        digests={file.name: hash_file(file) for each in given for file in _listed_files(each)},
     )
 
 
@@ -147,10 +147,8 @@ def _refuse_metres(profiles: list[np.ndarray], poses: np.ndarray) -> None:
         )
 
 
-def require_table(poses: np.ndarray, *, axis: str) -> None:
-    """Raise DescriptionError if poses (P, 4, 4) are not rotations about a table's z axis, or the axis is unknown."""
-    if axis not in SENSOR_AXES:
-        raise DescriptionError(f"the axis is {axis!r}; expected one of {', '.join(SENSOR_AXES)} of the sensor's frame")
+def require_table(poses: np.ndarray) -> None:
+    """Raise DescriptionError if poses (P, 4, 4) are not rotations about a table's z axis."""
     turns = np.linalg.inv(poses[0]) @ poses
     if max(np.abs(turns[:, 2] - (0, 0, 1, 0)).max(), np.abs(turns[:, :2, 3]).max()) > _ON_AXIS:
         raise DescriptionError(
@@ -186,8 +184,15 @@ def _checked_times(
     return wanted, times
 
 
+def _listed_files(path: Path) -> list[Path]:
+    """Return the CSV files of a folder, in the order of the numbers in their names, or a file alone."""
+    if not path.is_dir():
+        return [path]
+    return sorted((each for each in path.iterdir() if each.suffix.lower() == ".csv"), key=lambda p: natural_key(p.name))
+
+
 def read_profiles(
-    path: str | Path, *, unit: Unit | None = None, digests: dict[str, str] | None = None
+    path: str | Path, *, unit: Unit | None = None
 ) -> tuple[list[str], list[np.ndarray], np.ndarray | None]:
     """Read names, profiles (N, 2) or (N, 3) in mm, and times of profiles (or None) from files.
 
@@ -196,28 +201,24 @@ def read_profiles(
     names are x and z. Empty or NaN cells are missing points. In a cloud of the program, the points of pose n are in
     frame n. Raises DescriptionError for anything else.
     """
-    path, digests = Path(path), {} if digests is None else digests
+    path = Path(path)
     if path.is_dir():
-        files = sorted(
-            (each for each in path.iterdir() if each.suffix.lower() == ".csv"), key=lambda p: natural_key(p.name)
-        )
-        if not files:
+        if not (files := _listed_files(path)):
             raise DescriptionError(f"{path} holds no CSV files: expected one for each pose")
         listed = [file.name for file in files]
         log_warnings(path, name_gaps(listed, count_names(listed)))
         names, profiles, times = [], [], []
         for file in files:
-            table = read_number_table(file, digests)
+            table = read_number_table(file)
             names.append(file.stem)
             profiles.append(_points_of(table, unit))
             times.append(float(next(iter(table.columns.get("time_s", ())), np.nan)))
     elif path.suffix.lower() in (".ply", ".h5") and is_cloud(path):
-        digests[path.name] = hash_file(path)
         cloud = read_cloud(path)
         frames = np.unique(cloud.frame)
         return [str(frame) for frame in frames], [cloud.points_mm[cloud.frame == frame] for frame in frames], None
     else:
-        table = read_number_table(path, digests)
+        table = read_number_table(path)
         columns = table.columns
         if "pose" not in columns:
             raise DescriptionError(f"{path} has no column 'pose', the pose to which each point belongs")

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from io import BytesIO
 from itertools import takewhile
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 import pyarrow as pa
@@ -14,7 +14,6 @@ from pyarrow import csv
 
 from uwlts.errors import DescriptionError, Error
 from uwlts.files.reading import read_bytes, shorten
-from uwlts.files.writing import hash_file
 
 Unit = Literal["mm", "m"]
 MM_PER_UNIT: dict[Unit, float] = {"mm": 1.0, "m": 1000.0}
@@ -113,7 +112,7 @@ def choose_scale(stated: str, unit: Unit | None, path: Path, error: type[Error] 
 
     Raises ``error`` if both are given and differ.
     """
-    given = MM_PER_UNIT[check_unit(unit or "mm")]
+    given = MM_PER_UNIT[unit or "mm"]
     if unit is not None and stated and _LENGTHS[stated] != given:
         raise error(f"{path} states {stated}, but the unit {unit} was given: leave the unit out, or correct the file")
     return _LENGTHS[stated] if stated else given
@@ -129,13 +128,6 @@ def find_stated_unit(texts: Iterable[str]) -> tuple[str, list[str]]:
     said = [text for text in texts if _UNIT_IN_COMMENT.search(text.lower())]
     doubt = "a comment may state another unit than that of the coordinates"
     return "", [f"{doubt}: {shorten(said[0], 100)}"] if said else []
-
-
-def check_unit(unit: Unit) -> Unit:
-    """Return the unit; raises DescriptionError if it is neither mm nor m."""
-    if unit not in get_args(Unit):
-        raise DescriptionError(f"the unit is {unit!r}; expected mm or m")
-    return unit
 
 
 def _split_lines(
@@ -177,7 +169,7 @@ def _find_names(
     return cells if unit_row is None else _add_units(cells, _name_cells(unit_row, delimiter, count), path)
 
 
-def read_number_table(path: Path, digests: dict[str, str] | None = None, *, named: bool = True) -> NumberTable:
+def read_number_table(path: Path, *, named: bool = True) -> NumberTable:
     """Read a table of numbers, separated by commas, semicolons, tabs or blanks.
 
     With separators other than commas, numbers may have decimal commas. Lines that begin with #, //, % or ! are
@@ -185,13 +177,11 @@ def read_number_table(path: Path, digests: dict[str, str] | None = None, *, name
     with the number of rows is recognised, as are other lines before such names, a row of units below them, UTF-8,
     UTF-16 and Latin-1. Names are in lower case and without unit.
     Usual names for times, positions, quaternions and Euler angles become ``time_s``, ``x``, ``qw``, ``roll`` and so
-    on. Without names, two columns are x and z, and others are numbered. ``digests`` takes the file's SHA-256 by name.
+    on. Without names, two columns are x and z, and others are numbered.
 
     Raises DescriptionError if the file is no such table, rows are missing, or a name states an unknown unit.
     """
     content = read_bytes(path, most_bytes=_MOST_BYTES, error=DescriptionError, called="table")
-    if digests is not None:
-        digests[path.name] = hash_file(path)
     content = _decode_wide(content, path)
     comments, block, header, unit_row, lines = _split_lines(content, path)
     delimiter, comma = _separators(lines[0])

@@ -58,19 +58,16 @@ def count_names(names: Sequence[str]) -> Counted | None:
     columns = [[int(number) for number in column] for column in zip(*(part[1::2] for part in parts), strict=True)]
     varying = [column for column in columns if len(set(column)) > 1]
     if len(varying) < 2:
-        _require_increasing(names, varying[0] if varying else columns[0])
+        for place, (one, two) in enumerate(pairwise(varying[0] if varying else columns[0])):
+            if one >= two:
+                problem = (
+                    "have the same number: remove one" if one == two else "are in the reverse order of their numbers"
+                )
+                raise DescriptionError(
+                    f"{names[place]} and {names[place + 1]} {problem}, or give a table with a column stage_mm"
+                )
     counts = [_count(np.array(column)) for column in varying if max(column) < 10**_LONGEST]
     return min((each for each in counts if each is not None), key=lambda each: each.places()[-1], default=None)
-
-
-def _require_increasing(names: Sequence[str], numbers: list[int]) -> None:
-    """Raise DescriptionError if a number occurs twice, or is smaller than the one before."""
-    for place, (one, two) in enumerate(pairwise(numbers)):
-        if one >= two:
-            problem = "have the same number: remove one" if one == two else "are in the reverse order of their numbers"
-            raise DescriptionError(
-                f"{names[place]} and {names[place + 1]} {problem}, or give a table with a column stage_mm"
-            )
 
 
 def _count(numbers: np.ndarray) -> Counted | None:
@@ -138,17 +135,12 @@ def unwrap_counts(counts: ArrayLike, bits: int | None = None, *, returns: bool =
             )
         counts, steps = continued, np.diff(continued)
         break
-    if not returns:
-        _refuse_restart(counts, steps)
-    return counts
-
-
-def _refuse_restart(counts: np.ndarray, steps: np.ndarray) -> None:
-    """Raise DescriptionError for a jump against the motion that no other step comes near."""
+    # A jump against the motion that no other step comes near is a restart.
     against = steps * -np.sign(np.median(steps)) if len(steps) else steps
-    if (worst := against.max(initial=0)) > _PLAIN * max(-against.min(initial=0), 1):
+    if not returns and (worst := against.max(initial=0)) > _PLAIN * max(-against.min(initial=0), 1):
         place = int(np.argmax(against))
         raise DescriptionError(
             f"the encoder jumps back from {counts[place]:.0f} to {counts[place + 1]:.0f} after image {place + 1}, by "
             f"{worst:.0f} counts: its counter started again, or the stage returned (repeated = true)"
         )
+    return counts

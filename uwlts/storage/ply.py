@@ -1,7 +1,6 @@
 """Files in PLY, text or binary: vertices with any numbers as properties, comments, and triangles."""
 
 import os
-import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -94,7 +93,8 @@ def _fault(path: Path, what: str) -> CaptureError:
     return CaptureError(f"{path} is not a complete PLY file: {what}")
 
 
-def _read_header(path: Path, *, called: str) -> _Header:
+def _split_header(path: Path, *, called: str) -> tuple[bytes, int, int]:
+    """Return the header, its length with the line of its end, and the size of the file."""
     with open_regular(path, called=called) as file:
         start, size = file.read(_LONGEST_HEADER), os.fstat(file.fileno()).st_size
     text, end, rest = start.partition(b"end_header")
@@ -105,6 +105,11 @@ def _read_header(path: Path, *, called: str) -> _Header:
     newline = b"\n" if text.startswith(b"ply\n") else b"\r\n" if text.startswith(b"ply\r\n") else b"\r"
     if not rest.startswith(newline):
         raise _fault(path, "early end-of-file, or other characters after end_header")
+    return text, len(text) + len(end) + len(newline), size
+
+
+def _read_header(path: Path, *, called: str) -> _Header:
+    text, used, size = _split_header(path, called=called)
     order, elements, comments = "", {}, []
     count, properties = 0, []
     for line in text.translate(_IN_ASCII).decode("ascii").splitlines()[1:]:
@@ -127,7 +132,7 @@ def _read_header(path: Path, *, called: str) -> _Header:
     if not order:
         raise _fault(path, "its header names no format")
     _require_complete(elements, size, path, ascii_text=order == "ascii")
-    return _Header(order == "ascii", _ORDERS[order], elements, comments, len(text) + len(end) + len(newline))
+    return _Header(order == "ascii", _ORDERS[order], elements, comments, used)
 
 
 def _require_complete(
@@ -202,27 +207,30 @@ def _parse_bytes(
         (listed,) = (one for one in properties if one.length)
         if (rows[f"{listed.name} length"] == row[listed.name].shape[0]).all():
             return rows[[one.name for one in properties]], used
-    table, place, view = np.empty(count, kind), 0, content.data
-    sizes = {code: np.dtype(code).itemsize for code in _NAMES}
-    formats = {code: order + np.dtype(code).char for code in _NAMES}
-    try:
-        for number in range(count):
-            for one in properties:
-                code = one.length or one.kind
-                (value,) = struct.unpack_from(formats[code], view, place)
-                place += sizes[code]
-                if one.length is None:
-                    table[one.name][number] = value
-                elif not 0 <= value <= len(content):
+    return _parse_lists(np.asarray(content), properties, np.empty(count, kind), order, path)
+
+
+def _parse_lists(
+    content: np.ndarray, properties: Sequence[_Property], table: np.ndarray, order: str, path: Path
+) -> tuple[np.ndarray, int]:
+    """Fill the table of an element with lists of any lengths; return it and the number of bytes."""
+    kinds, place = {code: np.dtype(order + code) for code in _NAMES}, 0
+
+    def read(code: str, number: int) -> np.ndarray:
+        nonlocal place
+        place += number * kinds[code].itemsize
+        if place > len(content):
+            raise _fault(path, "early end-of-file within an element with lists")
+        return content[place - number * kinds[code].itemsize : place].view(kinds[code])
+
+    for number in range(len(table)):
+        for one in properties:
+            value = read(one.length or one.kind, 1)[0]
+            if one.length is not None:
+                if not 0 <= value <= len(content):
                     raise _fault(path, f"a list {one.name} has the length {value}")
-                else:
-                    end = place + int(value) * sizes[one.kind]
-                    table[one.name][number] = np.frombuffer(view[place:end], order + one.kind)
-                    place = end
-    except (struct.error, ValueError) as error:
-        raise _fault(path, "early end-of-file within an element with lists") from error
-    if place > len(content):
-        raise _fault(path, "early end-of-file within an element with lists")
+                value = read(one.kind, int(value))
+            table[one.name][number] = value
     return table, place
 
 

@@ -39,16 +39,11 @@ _NEAR_HALF_TURN = 3.0
 """Angles in rad reach pi, unless turns are small; the largest in deg is between 3 and pi by chance only."""
 _METRES = np.array([1e3] * 3 + [1.0] * 3)
 """Units of shifts in m and rotations in rad, in mm and rad."""
-_MOST_POSES = 1_000_000  # more than an hour at 200 poses a second
 _LATEST_S = 1e11  # Unix times in s reach it in the year 5138; larger numbers are in ms, us or ns
 
 
 def read_poses(
-    path: str | Path,
-    *,
-    pose_format: PoseFormat = "matrix",
-    unit: Unit | None = None,
-    digests: dict[str, str] | None = None,
+    path: str | Path, *, pose_format: PoseFormat = "matrix", unit: Unit | None = None
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Read ``T_base_platform`` (P, 4, 4) in mm, and times (P,) or None, from a CSV file with one pose per line.
 
@@ -68,8 +63,7 @@ def read_poses(
         Names or their units contradict the format or ``unit``, or the number of columns is wrong. Numbers are not
         finite, matrices not rigid, quaternions not of unit length, or angles in rad look like degrees.
     """
-    table = read_number_table(Path(path), digests, named=False)
-    return _poses(table, pose_format, unit)
+    return _poses(read_number_table(Path(path), named=False), pose_format, unit)
 
 
 def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", unit: Unit | None = None) -> Trajectory:
@@ -215,8 +209,6 @@ def _poses(table: NumberTable, pose_format: PoseFormat, unit: Unit | None) -> tu
                 "with the angles' unit, -deg or -rad"
             )
     rows = np.column_stack([columns[name] for name in names]) if columns else np.empty((0, 0))
-    if len(rows) > _MOST_POSES:
-        raise DescriptionError(f"{path} has {len(rows):,} poses; this program reads up to {_MOST_POSES:,}")
     wrong = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if len(wrong):
         raise DescriptionError(f"{path}: pose {wrong[0] + 1} has a number that is missing or not finite")

@@ -2,6 +2,7 @@
 
 import math
 from itertools import pairwise
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from twin.datasets.data_set import DataSetDescription, LogUniform, Normal, OneOf
 from twin.datasets.generation import choose_split, draw_scene
 from uwlts.errors import DescriptionError
 from uwlts.model.library import list_names
-from uwlts.storage.data_set import SPLITS
+from uwlts.storage.data_set import Split
 
 TINY = {"title": "tiny", "scene": "plane", "sensor": "thesis-small"}
 POWER = "sensor.laser.power_mw"
@@ -87,7 +88,7 @@ def test_splits_are_by_scene_and_keep_their_members_as_scenes_are_added():
     for scene in range(20):
         assert choose_split(few, scene) == choose_split(many, scene)
     members = [choose_split(many, scene) for scene in range(2000)]
-    for split, share in zip(SPLITS, (0.8, 0.1, 0.1), strict=True):
+    for split, share in zip(get_args(Split), (0.8, 0.1, 0.1), strict=True):
         # Multiples of the golden section fill every interval nearly evenly.
         assert members.count(split) == pytest.approx(2000 * share, abs=5)
     assert {choose_split(described(splits={"train": 0, "validation": 0, "test": 1}), k) for k in range(50)} == {"test"}

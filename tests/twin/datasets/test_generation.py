@@ -11,6 +11,7 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from uwlts.files.json_files import json_text
 from uwlts.files.writing import hash_file
 from uwlts.model.library import load_sensor
 from uwlts.radiometry.image_sets import open_image_set
-from uwlts.storage.data_set import SPLITS
+from uwlts.storage.data_set import Split
 
 SMALL = {"camera": {"width_px": 160, "height_px": 128, "pixel_size_um": 42.4}}
 LABELS = ("centre", "quality", "points", "masks", "light", "depth", "sensor")
@@ -143,10 +144,12 @@ def test_scenes_that_the_sensor_cannot_see_are_drawn_anew(tmp_path, monkeypatch)
 
 
 def test_splits_hold_different_scenes_and_together_all(folder):
-    scenes = {split: {each["info"]["scene"] for each in twin.load_dataset(folder, split=split)} for split in SPLITS}
+    scenes = {
+        split: {each["info"]["scene"] for each in twin.load_dataset(folder, split=split)} for split in get_args(Split)
+    }
     assert sorted(scene for members in scenes.values() for scene in members) == list(range(8))
     assert all(members for members in scenes.values())
-    for split in SPLITS:
+    for split in get_args(Split):
         assert {each["info"]["split"] for each in twin.load_dataset(folder, split=split)} == {split}
 
 

@@ -3,14 +3,7 @@
 import numpy as np
 import pytest
 
-from uwlts.fitting.next_observation import (
-    Candidate,
-    CovarianceRoot,
-    Forecast,
-    eliminate_others,
-    find_weak_directions,
-    rank_candidates,
-)
+from uwlts.fitting.next_observation import Candidate, CovarianceRoot, Forecast, eliminate_others, rank_candidates
 
 RNG = np.random.default_rng(5)
 BY_PARAMETERS = RNG.normal(size=(40, 4)) * [1.0, 1e3, 1e-3, 1.0]
@@ -22,6 +15,11 @@ def inverse(information):
     """Inverse without an elimination, by a pseudo-inverse of the scaled matrix."""
     scale = 1 / np.sqrt(np.diag(information))
     return np.linalg.pinv(information * np.outer(scale, scale)) * np.outer(scale, scale)
+
+
+def named(information):
+    """Return candidates from the diagonals of the information that they add."""
+    return [Candidate(words=name, information=np.diag(own), pose=np.eye(4)) for name, own in information.items()]
 
 
 def test_uncertainty_after_a_candidate_is_that_of_the_estimate_with_it():
@@ -47,7 +45,7 @@ def test_a_parameter_without_information_is_uncertain_until_a_candidate_determin
 def test_the_candidate_for_the_wanted_lengths_is_first():
     """Of two candidates, each determines one of two parameters; only the second changes the length."""
     length, known = np.array([[0.0, 1.0]]), CovarianceRoot(np.eye(2))
-    one, other = (Candidate(words=name, information=np.diag(added)) for name, added in (("a", [99, 0]), ("b", [0, 3])))
+    one, other = named({"a": [99, 0], "b": [0, 3]})
     best, last = rank_candidates(known, length, [one, other])
     assert (best.candidate, best.before, best.after) == (other, 1.0, pytest.approx(0.5))
     assert (last.candidate, last.gain) == (one, pytest.approx(0.0))
@@ -56,25 +54,17 @@ def test_the_candidate_for_the_wanted_lengths_is_first():
 
 
 def test_a_candidate_is_advised_if_it_lowers_the_uncertainty_by_a_twentieth():
-    shot, after = Candidate(words="a shot", information=np.eye(1)), CovarianceRoot(np.eye(1))
+    (shot,), after = named({"a shot": [1]}), CovarianceRoot(np.eye(1))
     assert Forecast(shot, 0.1, 0.0949, after).advice("lengths over the volume") == (
         "a shot would reduce the standard uncertainty of lengths over the volume from 0.1000 to 0.0949 mm"
     )
     assert Forecast(shot, 0.1, 0.0951, after).advice("lengths").startswith("no single further image would reduce")
 
 
-def test_weak_directions_are_the_principal_components_of_the_lengths():
-    weak, other = find_weak_directions(np.diag([4.0, 1.0]), np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]]))
-    assert np.abs(weak.changes) == pytest.approx([2.0, 0.0, 0.0])
-    assert np.abs(other.changes) == pytest.approx([0.0, 1.0, 0.0])
-    assert (weak.parameters, other.parameters, weak.confused) == ([0], [1], False)
-
-
 def test_the_second_of_two_passes_is_ranked_after_the_first():
     """Two passes determine the same parameter better than a third determines the other: one of each is chosen."""
     known, lengths = CovarianceRoot(np.eye(2)), np.eye(2)
-    names = {"shift": [99, 0], "long shift": [120, 0], "lift": [0, 50]}
-    passes = [Candidate(words=name, information=np.diag(added)) for name, added in names.items()]
+    passes = named({"shift": [99, 0], "long shift": [120, 0], "lift": [0, 50]})
     first = rank_candidates(known, lengths, passes)[0]
     second = rank_candidates(first.known, lengths, [each for each in passes if each is not first.candidate])[0]
     assert (first.candidate.words, second.candidate.words) == ("long shift", "lift")

@@ -461,6 +461,17 @@ def test_running_recording_can_be_followed(tmp_path: Path):
         assert len(capture) == 40
 
 
+def test_the_process_that_records_reads_its_part(tmp_path: Path):
+    path = tmp_path / "a.h5"
+    with CaptureWriter(path, a_header(), dtype=np.uint8) as writer:
+        for index in range(4):
+            writer.append(a_frame(index))
+            with Capture(part_path(path)) as capture:
+                assert_holds(capture, index + 1)
+    with Capture(path) as capture:
+        assert_holds(capture, 4)
+
+
 def test_finished_capture_has_many_readers(tmp_path: Path):
     path = record(tmp_path / "a.h5", 3)
     path.chmod(0o444)

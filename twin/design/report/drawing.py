@@ -16,10 +16,9 @@ from matplotlib.figure import Figure
 from twin.design.figures_of_merit import evaluate_field
 from twin.design.report.study_tables import number_text
 from twin.design.sensor_arrays import SensorArrays, extract_parameters
-from uwlts.errors import DesignError
-from uwlts.model.placement import LaserPose, laser_pose
+from uwlts.model.placement import laser_pose
 from uwlts.model.sensor import Camera, Medium, Sensor, Window
-from uwlts.optics.design import Lens, WindowGeometry, trace_rays, undistort_pixels
+from uwlts.optics.design import Lens, WindowGeometry, standoff_mm, trace_rays, undistort_pixels
 from uwlts.pages.toolkit import BLUE, INK, RED, SOFT, new_figure
 
 _BEYOND = 1.06  # length of drawn rays and sheet relative to the distance of the volume's far end
@@ -69,43 +68,39 @@ class SideView:
 
 
 def make_view(sensor: Sensor, medium: Medium) -> SideView:
-    """Return the side view of a sensor in a medium.
-
-    Raises DesignError if the sheet does not cross the camera's axis in front of the window, or the laser points back to
-    the camera; Error as for `twin.design.sensor_arrays.extract_numbers`.
-    """
+    """Return the side view of a sensor that works in a medium."""
     pose, p, camera = laser_pose(sensor), extract_parameters([sensor], [medium]), sensor.camera
-    outer = float(p.outer_mm(np).item())
-    crossing = _crossing_mm(pose, outer)
+    outer, crossing = (float(depth.item()) for depth in (p.outer_mm(np), standoff_mm(p.pose(np))))
     start = np.array([0.0, 0.0, crossing])
 
     def on_sheet(depths: np.ndarray) -> np.ndarray:
         """Return points (N, 3) at depths on the line through ``start`` along the laser's axis."""
         return start + ((depths - crossing) / pose.axis[2])[:, None] * pose.axis
 
-    # Camera and laser are both modules: a frame with z along the axis, and optionally a window.
-    seeing = _ModuleGeometry.from_description(sensor, camera.window, medium, np.zeros(3), np.eye(3))
+    # Camera and laser are both modules: an origin, an axis, and optionally a window.
+    pupil, ahead = np.zeros(3), np.array([0.0, 0.0, 1.0])
     frame = np.stack([pose.normal, np.cross(pose.axis, pose.normal), pose.axis], axis=1)
-    lighting = _ModuleGeometry.from_description(sensor, sensor.laser.window, medium, pose.origin_mm, frame)
-    lens = Lens.from_description(camera)
+    windows = [
+        WindowGeometry.from_description(one, medium, sensor.laser.wavelength_nm, turned) if one.mounted else None
+        for one, turned in ((camera.window, np.eye(3)), (sensor.laser.window, frame))
+    ]
     depths, reached = _reach(sensor, p)
     near, far = outer + depths[[0, -1]]
 
     end = pose.origin_mm + _BEYOND * ((on_sheet(np.array([far]))[0] - pose.origin_mm) @ pose.axis) * pose.axis
-    (axis,) = lighting.rays(pose.axis[None], end, pose.axis)
+    (axis,) = _trace(pose.origin_mm, windows[1], pose.axis[None], end, pose.axis)
 
     # The side view is along the sheet for any roll of the fan, with the laser on the positive side.
     sideways = math.hypot(*pose.normal[:2])
     across = pose.normal[:2] / sideways * (-1 if pose.normal[:2] @ pose.origin_mm[:2] < 0 else 1)
-    side_axes = np.array([[*across, 0.0], [0.0, 0.0, 1.0]])
-    ahead = np.array([0.0, 0.0, 1.0])
-    border = undistort_pixels(lens, _border_towards(camera, across))
+    side_axes = np.array([[*across, 0.0], ahead])
+    border = undistort_pixels(Lens.from_description(camera), _border_towards(camera, across))
     return SideView(
-        camera=seeing.project(side_axes),
-        laser=lighting.project(side_axes),
+        camera=_project(pupil, ahead, camera.window, windows[0], side_axes),
+        laser=_project(pose.origin_mm, pose.axis, sensor.laser.window, windows[1], side_axes),
         pupil_mm=camera.focal_length_mm / camera.f_number,
         baseline_mm=math.hypot(*pose.origin_mm[:2]),
-        edges=tuple(seeing.rays(border, far * _BEYOND * ahead, ahead) @ side_axes.T),
+        edges=tuple(_trace(pupil, windows[0], border, far * _BEYOND * ahead, ahead) @ side_axes.T),
         sheet=axis @ side_axes.T,
         volume=on_sheet(np.array([near, far])) @ side_axes.T,
         in_view=on_sheet(outer + depths[reached][[0, -1]]) @ side_axes.T if reached.any() else None,
@@ -113,21 +108,6 @@ def make_view(sensor: Sensor, medium: Medium) -> SideView:
         outer_mm=outer,
         angle_rad=math.atan2(abs(pose.normal[2]), sideways),
     )
-
-
-def _crossing_mm(pose: LaserPose, outer: float) -> float:
-    """Return the depth of the sheet on the camera's axis; DesignError if it is not beyond the window."""
-    steep = abs(pose.normal[2]) > 1e-9  # otherwise the sheet is parallel to the axis
-    depth = float(pose.normal @ pose.origin_mm / pose.normal[2]) if steep else math.inf
-    # Limit of 100 m. For a normal along the axis, there is no side view.
-    if not outer < depth < 1e5 or math.hypot(*pose.normal[:2]) < 1e-9:
-        raise DesignError(
-            f"the sheet crosses the camera's axis {depth:.1f} mm from the entrance pupil; it must cross the axis at an "
-            f"angle, in front of the window's outer face at {outer:.1f} mm"
-        )
-    if pose.axis[2] <= 0:
-        raise DesignError("the laser points back towards the camera: turn its axis")
-    return depth
 
 
 def _reach(sensor: Sensor, p: SensorArrays) -> tuple[np.ndarray, np.ndarray]:
@@ -142,60 +122,39 @@ def _reach(sensor: Sensor, p: SensorArrays) -> tuple[np.ndarray, np.ndarray]:
 # --- camera and laser -------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _ModuleGeometry:
-    """Module (camera or laser): origin and axis in the camera frame, and window, described and mounted."""
+def _trace(
+    origin: np.ndarray, window: WindowGeometry | None, directions: np.ndarray, place: np.ndarray, normal: np.ndarray
+) -> np.ndarray:
+    """Trace rays (N, K, 3) from an origin through a window to a plane; NaN for rays that miss the plane."""
+    points = np.broadcast_to(origin, directions.shape)[:, None]
+    if window is not None:
+        points, directions = trace_rays(window, origin, directions)
+    last = points[:, -1]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        length = (place - last) @ normal / (directions @ normal)
+        end = last + np.where(length > 0, length, np.nan)[:, None] * directions
+    return np.concatenate([points, end[:, None]], axis=1)
 
-    origin: np.ndarray
-    axis: np.ndarray
-    described: Window
-    window: WindowGeometry | None
 
-    @classmethod
-    def from_description(
-        cls, sensor: Sensor, window: Window, medium: Medium, origin: np.ndarray, rotation: np.ndarray
-    ) -> _ModuleGeometry:
-        """Make the module of a described sensor.
-
-        ``origin`` (3,) is the entrance pupil or origin of the rays, ``rotation`` (3, 3) turns the module's frame, with
-        z along its axis, to the camera frame. The medium is outside the window.
-        """
-        flat = (
-            WindowGeometry.from_description(window, medium, sensor.laser.wavelength_nm, rotation)
-            if window.mounted
-            else None
-        )
-        return cls(origin, rotation[:, 2], window, flat)
-
-    def rays(self, directions: np.ndarray, place: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """Trace rays (N, K, 3) from the origin through the window to a plane; NaN for rays that miss the plane."""
-        points = np.broadcast_to(self.origin, directions.shape)[:, None]
-        if self.window is not None:
-            points, directions = trace_rays(self.window, self.origin, directions)
-        last = points[:, -1]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            length = (place - last) @ normal / (directions @ normal)
-            end = last + np.where(length > 0, length, np.nan)[:, None] * directions
-        return np.concatenate([points, end[:, None]], axis=1)
-
-    def project(self, axes: np.ndarray) -> Module:
-        """Project the module onto ``axes`` (2, 3)."""
-        forward = axes @ self.axis / np.linalg.norm(axes @ self.axis)
-        sideways = np.array([forward[1], -forward[0]])
-        place = axes @ self.origin
-        front, half, corners = _BARE_FRONT_MM, _BARE_HALF_MM, np.empty((0, 2))
-        if self.window is not None:
-            normal = np.array(self.window.normal)
-            seen = axes @ normal
-            half, front = self.described.aperture_diameter_mm / 2, self.described.distance_mm
-            along = half * (np.array([seen[1], -seen[0]]) / np.linalg.norm(seen))
-            inner = self.origin + front * self.axis
-            inner, outer = (axes @ face for face in (inner, inner + self.window.thickness_mm * normal))
-            corners = np.array([inner - along, inner + along, outer + along, outer - along])
-        side, back = (half + _WALL_MM) * sideways, _HOUSING_MM * forward
-        head = place + front * forward
-        rear = place - back
-        return Module(place, corners, np.array([rear - side, rear + side, head + side, head - side, rear - side]))
+def _project(
+    origin: np.ndarray, axis: np.ndarray, described: Window, window: WindowGeometry | None, view: np.ndarray
+) -> Module:
+    """Project a module in the camera frame, with its window as described and as mounted, onto the axes (2, 3)."""
+    forward = view @ axis / np.linalg.norm(view @ axis)
+    sideways = np.array([forward[1], -forward[0]])
+    place = view @ origin
+    front, half, corners = _BARE_FRONT_MM, _BARE_HALF_MM, np.empty((0, 2))
+    if window is not None:
+        normal = np.array(window.normal)
+        seen = view @ normal
+        half, front = described.aperture_diameter_mm / 2, described.distance_mm
+        along = half * (np.array([seen[1], -seen[0]]) / np.linalg.norm(seen))
+        inner = origin + front * axis
+        inner, outer = (view @ face for face in (inner, inner + window.thickness_mm * normal))
+        corners = np.array([inner - along, inner + along, outer + along, outer - along])
+    side = (half + _WALL_MM) * sideways
+    head, rear = place + front * forward, place - _HOUSING_MM * forward
+    return Module(place, corners, np.array([rear - side, rear + side, head + side, head - side, rear - side]))
 
 
 def _border_towards(camera: Camera, across: np.ndarray) -> np.ndarray:
@@ -225,28 +184,16 @@ _ARC = 0.4  # radius of the arc at the triangulation angle, relative to the stan
 def draw(view: SideView, other: SideView | None = None) -> Figure:
     """Draw a design to scale; another design is drawn behind it as dashed lines, as far as it fits."""
     figure, (axes,) = new_figure(*_INCHES)
-    box = _box(view)
-    for line in other.outlines() if other else ():
-        axes.plot(*line.T, "--", color=_BEHIND, linewidth=0.8)
-    axes.set(xlim=box[:, 0], ylim=box[::-1, 1], aspect="equal")
-    axes.grid(visible=False)
-    _draw_side(axes, view)
-    return figure
-
-
-def _box(view: SideView) -> np.ndarray:
-    """Return the smallest and largest coordinates (2, 2) of a view with its margins."""
     points = np.concatenate(view.outlines())
     points = points[np.isfinite(points).all(axis=1)]
     margin = _MARGIN * np.ptp(points, axis=0).max()
     low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
-    return np.stack([low, high + (_LABELS * (high - low)[0], 0.0)])
-
-
-def _labels_at(axes: Axes) -> float:
-    """Return the x coordinate of the labels' start."""
-    left, right = axes.get_xlim()
-    return left + (right - left) / (1 + _LABELS)
+    for line in other.outlines() if other else ():
+        axes.plot(*line.T, "--", color=_BEHIND, linewidth=0.8)
+    axes.set(xlim=(low[0], high[0] + _LABELS * (high - low)[0]), ylim=(high[1], low[1]), aspect="equal")
+    axes.grid(visible=False)
+    _draw_side(axes, view, labels_at=float(high[0]))
+    return figure
 
 
 def _fill(axes: Axes, points: np.ndarray, colour: str, alpha: float, edge: str = "none") -> None:
@@ -270,13 +217,13 @@ def _dimension(axes: Axes, start: tuple[float, float], end: tuple[float, float],
     axes.annotate(words, np.mean([start, end], axis=0), xytext=aside, **style)
 
 
-def _draw_side(axes: Axes, view: SideView) -> None:
+def _draw_side(axes: Axes, view: SideView, *, labels_at: float) -> None:
     cross, outer, (near, far) = float(view.crossing[1]), view.outer_mm, view.volume[:, 1].tolist()
     left, top = axes.get_xlim()[0], axes.get_ylim()[1]
     axes.axhspan(near, far, color=_VOLUME, zorder=0)
     for depth, name in ((near, "near"), (far, "far")):
         axes.axhline(depth, color=_VOLUME_END, linewidth=0.8, zorder=0)
-        axes.text(_labels_at(axes), depth, f"{name} {number_text(depth - outer)} mm", va="bottom")
+        axes.text(labels_at, depth, f"{name} {number_text(depth - outer)} mm", va="bottom")
     _fill(axes, np.concatenate([view.edges[0], view.edges[1][::-1]]), BLUE, 0.1)
     _draw_module(axes, view.camera, "camera")
     _draw_module(axes, view.laser, "laser")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from contextlib import suppress
 from functools import partial
 from html import escape
 from typing import Any
@@ -21,7 +20,6 @@ from twin.design.figures_of_merit import RENDERED_SCATTERING_DEPTH
 from twin.design.report import drawing, study_tables as tables
 from twin.design.study import Study
 from twin.design.verification import Agreement
-from uwlts.errors import Error
 from uwlts.pages.toolkit import (
     BLUE,
     COLOURS,
@@ -68,13 +66,11 @@ def shown_figures(judged: StudyResults) -> list[str]:
     return [name for name in names if np.isfinite(judged.figure(name)[judged.works]).any()]
 
 
-def figures_chart(judged: StudyResults, marked: Sequence[HighlightedDesign]) -> Interactive | None:
+def figures_chart(judged: StudyResults, marked: Sequence[HighlightedDesign]) -> Interactive:
     """Draw figures over the free ranges: over one, or by colour over two; over the rank if there are only choices.
 
-    Each point is a working design, hollow if it misses a constraint; None if no design works.
+    Each point is a working design, hollow if it misses a constraint.
     """
-    if not judged.works.any():
-        return None
     study, names = judged.study, shown_figures(judged)[:_MOST_PANELS]
     ranges = [name for name, variable in study.variables.items() if variable.values is None][:2]
     front = judged.front(judged.of_interest)
@@ -186,13 +182,11 @@ def choose_pareto_axes(judged: StudyResults) -> tuple[tuple[str, int], tuple[str
     return wanted[0], second
 
 
-def pareto_chart(judged: StudyResults, marked: Sequence[HighlightedDesign]) -> Interactive | None:
+def pareto_chart(judged: StudyResults, marked: Sequence[HighlightedDesign]) -> Interactive:
     """Draw all working designs over two figures, and the Pareto front of those that meet the constraints."""
     (x, x_sign), (y, y_sign) = choose_pareto_axes(judged)
     values = np.column_stack([judged.figure(x) * x_sign, judged.figure(y) * y_sign])
     known = judged.works & np.isfinite(values).all(axis=1)
-    if not known.any():
-        return None
     front = find_pareto_front(np.where((judged.of_interest & known)[:, None], values, np.nan))
     shown = sample(known, front, MOST_POINTS)
     figure = go.Figure()
@@ -279,15 +273,12 @@ def page_text(
 ) -> str:
     """Return the page of a study as HTML.
 
-    Highlighted designs (``marked``) end with the chosen one; each rendered design has an agreement. Notes are sentences
-    for the top of the page.
+    At least one design works. Highlighted designs (``marked``) end with the chosen one; each rendered design has an
+    agreement. Notes are sentences for the top of the page.
 
     Raises EvaluationError if the columns belong to another study.
     """
     judged, collected = StudyResults(study, columns), FigureCollector()
-    nothing = "" if judged.works.any() else "None of the designs works: see the reasons below."
-    over_free = figures_chart(judged, marked)
-    pareto = pareto_chart(judged, marked)
     return render_page(
         "twin.design.report",
         "template.html.j2",
@@ -295,12 +286,11 @@ def page_text(
         title=study.title,
         introduction=tables.introduction(judged),
         notes=list(notes),
-        label=marked[-1].label if marked else "",
-        chosen=tables.tiles(study, marked[-1], marked[0] if len(marked) > 1 else None) if marked else None,
+        label=marked[-1].label,
+        chosen=tables.tiles(study, marked[-1], marked[0] if len(marked) > 1 else None),
         drawing=_drawing(study, marked),
-        over_free=over_free and collected.add(*over_free),
-        pareto=pareto and collected.add(*pareto),
-        nothing=nothing if len(judged) else "No design has been evaluated.",
+        over_free=collected.add(*figures_chart(judged, marked)),
+        pareto=collected.add(*pareto_chart(judged, marked)),
         number=tables.number_text,
         value=tables.value_text,
         verdicts=[
@@ -315,21 +305,11 @@ def page_text(
     )
 
 
-def _drawing(study: Study, marked: Sequence[HighlightedDesign]) -> tuple[Markup | None, str]:
-    """Return the drawing of the chosen design and its caption, or None and the reason."""
-    if not marked:
-        return None, "There is no design to draw."
-    chosen, base = marked[-1], marked[0]
-    try:
-        view = drawing.make_view(chosen.sensor, study.medium_of(chosen.sensor))
-    except Error as error:
-        return None, f"The design cannot be drawn: {error}."
-    other = None
-    if base is not chosen:
-        with suppress(Error):
-            other = drawing.make_view(base.sensor, study.medium_of(base.sensor))
-    behind = f" Dashed grey behind, as far as it fits in: {base.label}." if other else ""
-    return figure_svg(drawing.draw(view, other)), _DRAWN + behind
+def _drawing(study: Study, marked: Sequence[HighlightedDesign]) -> tuple[Markup, str]:
+    """Return the drawing of the chosen design, the base sensor behind it, and its caption."""
+    views = [drawing.make_view(one.sensor, study.medium_of(one.sensor)) for one in (marked[-1], *marked[:-1][:1])]
+    behind = f" Dashed grey behind, as far as it fits in: {marked[0].label}." if len(views) > 1 else ""
+    return figure_svg(drawing.draw(*views)), _DRAWN + behind
 
 
 def _best(judged: StudyResults) -> tuple[list[str], list[list[str]]]:
@@ -343,6 +323,6 @@ def _best(judged: StudyResults) -> tuple[list[str], list[list[str]]]:
         [str(judged.columns["design"][place])]
         + [tables.format_design_value(judged, name, place, unit=False) for name in names]
         + ([f"{judged.figure('violation')[place]:.3g}"] if missed else [])
-        for place in (judged.best_first[:_BEST] if len(judged) else [])
+        for place in judged.best_first[:_BEST]
     ]
     return ["design", *map(tables.label_of, names), *(["constraints missed by"] if missed else [])], rows

@@ -90,10 +90,8 @@ def value_text(name: str, value: Value | None, *, unit: bool = True) -> str:
     """Format the value of a figure or a free variable with its unit."""
     if isinstance(value, bool):
         return "yes" if value else "no"
-    if value is None:
-        return MISSING
-    if isinstance(value, str):
-        return value
+    if value is None or isinstance(value, str):
+        return MISSING if value is None else value
     if name == "laser_class" and math.isfinite(value):
         return CLASS_NAMES.get(round(value), MISSING)
     if name == "coverage" and math.isfinite(value):
@@ -151,15 +149,13 @@ def _limit(name: str, sign: int, bound: float) -> str:
     return f"{'at most' if sign > 0 else 'at least'} {value_text(name, bound)}"
 
 
-def misses(study: Study, row: Mapping[str, Value | None]) -> dict[str, tuple[str, str]]:
-    """Return the figures that violate a bound, each with a text of value and bound, and a text of the bound alone."""
-    found = {}
-    for name, sign, bound in study.bounds():
-        value = row.get(name)
-        if isinstance(value, int | float) and sign * (value - bound) > 0:
-            required = f"{_limit(name, sign, bound)} is required"
-            found[name] = f"{words_of(name)} is {value_text(name, value)}, {required}", required
-    return found
+def misses(study: Study, row: Mapping[str, Value | None]) -> dict[str, str]:
+    """Return the figures that violate a bound, each with a text of the bound."""
+    return {
+        name: f"{_limit(name, sign, bound)} is required"
+        for name, sign, bound in study.bounds()
+        if isinstance(value := row.get(name), int | float) and sign * (value - bound) > 0
+    }
 
 
 _CHOSEN = {
@@ -219,7 +215,7 @@ def tiles(study: Study, chosen: HighlightedDesign, compared: HighlightedDesign |
         text, beside = value_text(name, row.get(name)), value_text(name, other.get(name))
         notes = (
             note,
-            f"misses its bound: {missed[name][1]}" if name in missed else "",
+            f"misses its bound: {missed[name]}" if name in missed else "",
             "beyond the rendered designs" if describe_turbidity(chosen) and name == "scattering_depth" else "",
             "not reached by camera or laser" if name.startswith("sigma_z_") and text == MISSING else "",
             f"{label}: {beside}" if beside not in (MISSING, label, "base") else "",

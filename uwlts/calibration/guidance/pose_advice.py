@@ -1,6 +1,6 @@
 """Guidance of a camera calibration: what the recorded poses determine, what is missing, and the most helpful pose."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Annotated
@@ -123,20 +123,17 @@ class Coverage:
 
     def with_points(self, pixels: np.ndarray) -> "Coverage":
         """Add the points (N, 2) of one image; points outside the image are ignored."""
-        rows, columns = self.counts.shape
         # Pixel (0, 0) is the centre of the first pixel, so the image starts half a pixel before it.
-        place = np.floor((pixels + 0.5) / [self.width_px, self.height_px] * [columns, rows]).astype(int)
-        column, row = place[((place >= 0) & (place < [columns, rows])).all(axis=1)].T
-        counts = self.counts.copy()
-        np.add.at(counts, (row, column), 1)
-        return replace(self, counts=counts)
+        image = (-0.5, self.height_px - 0.5), (-0.5, self.width_px - 0.5)
+        added = np.histogram2d(pixels[:, 1], pixels[:, 0], bins=self.counts.shape, range=image)[0]
+        return replace(self, counts=self.counts + added.astype(int))
 
     def emptiest(self) -> str | None:
         """Name the ninth of the image with most empty cells; None if no cell is empty."""
         empty = ~self.covered
         if not empty.any():
             return None
-        rows, columns = (np.minimum(3 * np.arange(n) // n, 2) for n in empty.shape)
+        rows, columns = (3 * np.arange(n) // n for n in empty.shape)
         ninths = np.zeros((3, 3))
         np.add.at(ninths, (rows[:, None], columns[None, :]), empty)
         row, column = np.unravel_index(int(np.argmax(ninths)), (3, 3))
@@ -167,13 +164,11 @@ def tilts_rad(pose: np.ndarray) -> tuple[float, float]:
     return float(np.arctan2(-normal[0], normal[2])), float(np.arctan2(-normal[1], normal[2]))
 
 
-TILT_RAD = np.radians(25.0)  # easily reached by hand, and printed circles remain detectable
+_TILT_RAD = np.radians(25.0)  # easily reached by hand, and printed circles remain detectable
 _PLACES = (0.2, 0.5, 0.8)  # fractions of the image's sides
 _DEPTHS = (0.1, 0.5, 0.9)  # fractions of the working range
 _MARGIN_PX = 10.0  # margin of the image, in which circles would be cut
 _SAMPLE = 100  # points used for a candidate's information; more are redundant
-
-
 _USUAL_SIGMA_PX = 0.1  # usual point noise, until residuals are known
 _LEAST_SIGMA_PX = 0.02  # smallest point noise: sharp circles, also in reality
 # Prior standard deviations of a described lens: relative to the focal length and the image's side, and of plain
@@ -194,6 +189,9 @@ _BEYOND = 0.05  # decides between poses once all limits are reached
 _SAME_TILT_RAD = np.radians(9.0)  # tilt difference from the advised pose without an instruction: a hand can keep it
 _SAME_PLACE = 0.15  # the same for the target's middle, relative to the image's sides
 _SAME_DISTANCE = 0.1  # the same for the distance, relative to it
+
+
+PoseAdvice = Forecast[Candidate]  # expected effect of a pose ``T_camera_target`` on `compute_shortfall`
 
 
 class CompletionLimits(Description):
@@ -332,46 +330,37 @@ def _find_missing_tilt(state: State) -> np.ndarray:
     return np.maximum(1 - reached / np.radians(state.wanted.tilt_deg), 0.0)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class CandidatePose(Candidate):
-    """Candidate pose ``T_camera_target`` (4, 4), with the pixels (N, 2) of its image."""
-
-    pose: np.ndarray
-    pixels: np.ndarray
-
-
-PoseAdvice = Forecast[CandidatePose]  # expected effect of a pose on `compute_shortfall`
+def _project_inside(state: State, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pixels (N, 2) of all target points at a pose, and the mask (N,) of those well inside the image."""
+    camera = state.camera
+    pixels = project(camera, state.setting.target.points_mm @ pose[:3, :3].T + pose[:3, 3])
+    largest = [camera.width_px - _MARGIN_PX, camera.height_px - _MARGIN_PX]
+    return pixels, np.all((pixels > _MARGIN_PX) & (pixels < largest), axis=1)
 
 
-def candidates(state: State, *, spin_rad: float = 0.0) -> list[CandidatePose]:
-    """Return poses with a detectable target: three distances, nine places in the image, nine tilts.
+def candidates(state: State, *, spin_rad: float = 0.0) -> Iterator[Candidate]:
+    """Generate poses with a detectable target: three distances, nine places in the image, nine tilts.
 
     One tilt is zero; the others move one of eight sides away from the camera. ``spin_rad`` is the target's rotation in
     the image, from its x axis to the image's.
     """
     camera, target, sensor = state.camera, state.setting.target, state.setting.sensor
     volume, window = sensor.volume, sensor.camera.window
-    outer = window.distance_mm + window.thickness_mm
-    nearest, farthest = outer + volume.near_mm, outer + volume.far_mm
+    outer, extent = window.distance_mm + window.thickness_mm, volume.far_mm - volume.near_mm
     points, middle = target.points_mm, target.points_mm.mean(axis=0)
-    largest = [camera.width_px - _MARGIN_PX, camera.height_px - _MARGIN_PX]
     step = max(1, len(points) // _SAMPLE)
     spin = cv2.Rodrigues(np.array([0.0, 0.0, spin_rad]))[0]
     sides = np.arange(8) * np.pi / 4
-    tilts = [np.zeros(3), *(TILT_RAD * np.array([np.sin(side), -np.cos(side), 0.0]) for side in sides)]
-    found = []
+    tilts = [np.zeros(3), *(_TILT_RAD * np.array([np.sin(side), -np.cos(side), 0.0]) for side in sides)]
     for depth, x, y, tilt in product(_DEPTHS, _PLACES, _PLACES, tilts):
-        distance = nearest + depth * (farthest - nearest)
         ray = directions(camera, np.array([[x * camera.width_px, y * camera.height_px]]))[0]
         turn = cv2.Rodrigues(tilt)[0] @ spin
-        pose = rigid_transform(turn, ray / ray[2] * distance - turn @ middle)
-        pixels = project(camera, points @ turn.T + pose[:3, 3])
-        inside = np.all((pixels > _MARGIN_PX) & (pixels < largest), axis=1)
+        pose = rigid_transform(turn, ray / ray[2] * (outer + volume.near_mm + depth * extent) - turn @ middle)
+        pixels, inside = _project_inside(state, pose)
         if target.is_findable(inside):
             sample = np.flatnonzero(inside)[::step]
             added = state.information_of(points[sample], pixels[sample], pose) * inside.sum() / len(sample)
-            found.append(CandidatePose(information=added, pose=pose, pixels=pixels[inside]))
-    return found
+            yield Candidate(information=added, pose=pose)
 
 
 def best_pose(state: State, *, spin_rad: float = 0.0, skipped: int = 0) -> PoseAdvice | None:
@@ -380,8 +369,11 @@ def best_pose(state: State, *, spin_rad: float = 0.0, skipped: int = 0) -> PoseA
     The candidates are compared by `compute_shortfall`.
     """
 
-    def figure(std: np.ndarray, candidate: CandidatePose | None) -> float:
-        seen = state if candidate is None else state.showing(candidate.pose, candidate.pixels)
+    def figure(std: np.ndarray, candidate: Candidate | None) -> float:
+        seen = state
+        if candidate is not None:
+            pixels, inside = _project_inside(state, candidate.pose)
+            seen = state.showing(candidate.pose, pixels[inside])
         return compute_shortfall(seen, dict(zip(state.keys, std.tolist(), strict=True)))
 
     every = np.eye(len(state.keys))
@@ -422,14 +414,13 @@ def format_pose_advice(aim: np.ndarray, state: State, pose: np.ndarray | None) -
 def _tilt_words(aim: np.ndarray, pose: np.ndarray | None) -> str:
     """Describe how to tilt the target: the side to move away, and the angle."""
     across, down = tilts_rad(aim)
-    size = np.degrees(np.arccos(np.clip(1 / np.sqrt(1 + np.tan(across) ** 2 + np.tan(down) ** 2), -1, 1)))
+    size, present = (np.degrees(np.arccos(np.clip(abs(p[2, 2]), 0, 1))) for p in (aim, aim if pose is None else pose))
     if size < 5:
         return "hold the target square to the camera"
     farther = {"lower": down, "upper": -down, "right": across, "left": -across}
     sides = [side for side, tilt in farther.items() if tilt > np.radians(5)]
     what = f"{sides[0]} side" if len(sides) == 1 else f"{' '.join(sides)} corner"
-    present = 1.0 if pose is None else np.clip(abs(pose[2, 2]), 0, 1)
-    now = "" if pose is None else f" (now it is tilted by {np.degrees(np.arccos(present)):.0f} deg)"
+    now = "" if pose is None else f" (now it is tilted by {present:.0f} deg)"
     return f"tilt the target so that its {what} is farther, {size:.0f} deg{now}"
 
 

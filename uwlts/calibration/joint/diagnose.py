@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import assert_never
 
 import numpy as np
@@ -9,8 +10,8 @@ from scipy.stats import chi2
 
 from uwlts.calibration.joint.estimate import UNSETTLED, Estimate, Evidence, outliers
 from uwlts.calibration.joint.gathering import USUAL_DISTORTION
-from uwlts.calibration.joint.residuals import SHIFT, STRETCH, TARGET, Residuals, TargetEvidence
-from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
+from uwlts.calibration.joint.residuals import BENDS, SHIFT, STRETCH, TARGET, Residuals, TargetEvidence
+from uwlts.calibration.joint.scanned_surfaces import SLOPES, SurfaceScanEvidence
 from uwlts.fitting.least_squares import robust_std
 from uwlts.model.parameter_keys import (
     LensParameter,
@@ -26,7 +27,6 @@ from uwlts.model.parameter_keys import (
 )
 from uwlts.model.sensor import Sensor
 
-_ALIGNMENT = "stage_direction in the captures, or uncertainty.stage_alignment_deg"
 _CHECK: dict[SingleParameter, str] = {
     WindowParameter.DISTANCE: "camera.window.distance_mm or uncertainty.window_distance_mm",
     WindowParameter.SLOPE_X: "the window's tilts or uncertainty.window_tilt_deg",
@@ -35,16 +35,11 @@ _CHECK: dict[SingleParameter, str] = {
     WindowParameter.GLASS_INDEX: "camera.window.glass",
     SheetParameter.BOW: "the target's flatness, the laser, or uncertainty.bow_deg",
     SheetParameter.WINDOW_TURN: "the medium, or uncertainty.laser_window_tilt_deg",
-    StageParameter.SLOPE_1: _ALIGNMENT,
-    StageParameter.SLOPE_2: _ALIGNMENT,
-    TargetParameter.BOW: "the target's flatness, or uncertainty.target_bow_mm",
-    TargetParameter.SADDLE: "the target's flatness, or uncertainty.target_bow_mm",
-    TargetParameter.TWIST: "the target's flatness, or uncertainty.target_bow_mm",
-    TargetParameter.STRETCH_X: "the target's spacings, or uncertainty.target_stretch",
-    TargetParameter.STRETCH_Y: "the target's spacings, or uncertainty.target_stretch",
+    **dict.fromkeys(SLOPES, "stage_direction in the captures, or uncertainty.stage_alignment_deg"),
+    **dict.fromkeys(BENDS, "the target's flatness, or uncertainty.target_bow_mm"),
+    **dict.fromkeys(STRETCH, "the target's spacings, or uncertainty.target_stretch"),
     **dict.fromkeys((LensParameter.F, LensParameter.FX, LensParameter.FY), "the target's spacing, lens and focus"),
-    LensParameter.P1: "the lens, or uncertainty.tangential",
-    LensParameter.P2: "the lens, or uncertainty.tangential",
+    **dict.fromkeys((LensParameter.P1, LensParameter.P2), "the lens, or uncertainty.tangential"),
 }
 """Entries to check for the parameters with prior knowledge."""
 
@@ -201,13 +196,17 @@ def check_consistency(result: Estimate, evidence: Sequence[Evidence], *, sensor:
 
 @dataclass(frozen=True)
 class Deviation:
-    """Deviation of a parameter: its value from evidence ``alone``, and ``known`` before with uncertainty ``std``."""
+    """Deviation of a parameter: its value from evidence ``alone``, and ``known`` before with uncertainty ``std``.
+
+    ``gain`` is the information gain, relative to ``std``.
+    """
 
     sigmas: float
     key: ParameterKey
     alone: float
     known: float
     std: float
+    gain: float
 
     def wrong(self) -> bool:
         """Return whether it is a contradiction, not only a doubt."""
@@ -219,36 +218,12 @@ class Deviation:
 
 
 def deviations(result: Estimate, *, least: float = _DOUBTFUL) -> list[Deviation]:
-    """Return parameters that deviate from prior knowledge by more than ``least`` standard uncertainties, sorted."""
-    far = [each for each, _ in _compare_with_priors(result) if each.sigmas > least]
-    return sorted(far, key=lambda each: each.sigmas, reverse=True)
-
-
-def estimate_birge_ratio(result: Estimate) -> float:
-    """Return the factor of too small prior uncertainties of sensor, media and stage, at least 1.
-
-    This is Birge's ratio, the RMS of deviations divided by standard uncertainties, if chance exceeds it less than once
-    in a thousand calibrations.
-    """
-    squares = np.array(
-        [
-            each.sigmas**2
-            for each, gain in _compare_with_priors(result)
-            if gain > _MUCH_GAINED and not isinstance(each.key, TargetParameter)
-        ]
-    )
-    if len(squares) < _FEWEST_GAINED or squares.sum() < chi2.isf(_FALSE_ALARM, len(squares)):
-        return 1.0
-    return float(np.sqrt(squares.mean()))
-
-
-def _compare_with_priors(result: Estimate) -> Iterator[tuple[Deviation, float]]:
-    """Compare parameters with prior knowledge; return deviation and relative information gain.
+    """Return parameters that deviate from prior knowledge by at least ``least`` standard uncertainties, sorted.
 
     The stripe's shift on the target is excluded: images have little information on it, so that small model errors
     dominate. The size of k1 and k2 is that of usual lenses, and nothing that a lens contradicts.
     """
-    parameters, covariance = result.parameters, result.covariance
+    parameters, covariance, found = result.parameters, result.covariance, []
     formal = covariance if result.formal_covariance is None else result.formal_covariance
     for key, value, known, std, after, exact in zip(
         parameters.keys,
@@ -264,20 +239,28 @@ def _compare_with_priors(result: Estimate) -> Iterator[tuple[Deviation, float]]:
             # exact: this is the variance of their difference if both are right (for none tied, 1 - after / std^2).
             gain = float(np.sqrt(max(1.0 + (after - 2 * exact) / std**2, _LEAST_GAIN**2)))
             alone = known + (value - known) / gain**2
-            yield Deviation(abs(value - known) / (gain * std), key, alone, known, std), gain
+            found.append(Deviation(abs(value - known) / (gain * std), key, alone, known, std, gain))
+    return sorted((each for each in found if each.sigmas >= least), key=lambda each: each.sigmas, reverse=True)
 
 
 @dataclass(frozen=True)
 class PriorDeviations:
-    """Deviations of ``every`` parameter from prior knowledge, the largest first, and Birge's ratio of them."""
+    """Deviations of ``every`` parameter of an estimate (`deviations` with a limit of 0)."""
 
     every: list[Deviation]
-    birge_ratio: float
 
-    @classmethod
-    def from_estimate(cls, result: Estimate) -> "PriorDeviations":
-        """Compare an estimate with its prior knowledge."""
-        return cls(deviations(result, least=0.0), estimate_birge_ratio(result))
+    @cached_property
+    def birge_ratio(self) -> float:
+        """Factor of too small prior uncertainties of sensor, media and stage, at least 1.
+
+        This is Birge's ratio, the RMS of deviations divided by standard uncertainties, if chance exceeds it less than
+        once in a thousand calibrations.
+        """
+        gained = [d for d in self.every if d.gain > _MUCH_GAINED and not isinstance(d.key, TargetParameter)]
+        squares = np.array([each.sigmas**2 for each in gained])
+        if len(squares) < _FEWEST_GAINED or squares.sum() < chi2.isf(_FALSE_ALARM, len(squares)):
+            return 1.0
+        return float(np.sqrt(squares.mean()))
 
     def of_target(self) -> list[Deviation]:
         """Return the deviations of the target's form and size."""
@@ -344,15 +327,13 @@ def compute_size_deviations(result: Estimate, evidence: Sequence[Evidence]) -> l
     found = []
     for piece, local, covariance in zip(evidence, result.local, result.local_covariances, strict=True):
         if isinstance(piece, SurfaceScanEvidence):
-            count = piece.surface.parameter_count()
+            count = piece.surface.parameter_count
             sizes = piece.surface.sizes(local[:count])
             variance = np.einsum("ci,ij,cj->c", sizes.by_local, covariance[:count, :count], sizes.by_local)
             off_std = np.sqrt(variance + np.where(np.isfinite(sizes.std_mm), sizes.std_mm, 0.0) ** 2)
-            quantities = (ParameterLabel(name, "mm") for name in sizes.names)
             figures = np.column_stack([sizes.described_mm, sizes.std_mm, sizes.off_mm, off_std]).tolist()
-            found += [
-                SizeDeviation(piece.scan(), *each) for each in zip(quantities, *zip(*figures, strict=True), strict=True)
-            ]
+            named = zip(sizes.names, figures, strict=True)
+            found += [SizeDeviation(piece.scan(), ParameterLabel(name, "mm"), *each) for name, each in named]
     return found
 
 
@@ -485,12 +466,9 @@ def _check_correlations(result: Estimate) -> Iterator[tuple[bool, str, str]]:
     """Find kinds with residuals correlated over many lines or points, as from a wrong lens or height."""
     for kind, noise in result.noise.items():
         if noise.together > _WAVES_DOUBTFUL:
-            where, values = ("across the image", "points") if kind == TARGET else ("along the stripe", "lines")
-            check = (
-                "the target's flatness, and the lens"
-                if kind == TARGET
-                else "heights, media and what else was described"
-            )
+            where, values, check = "along the stripe", "lines", "heights, media and what else was described"
+            if kind == TARGET:
+                where, values, check = "across the image", "points", "the target's flatness, and the lens"
             yield (
                 noise.together > _WAVES_WRONG,
                 kind,

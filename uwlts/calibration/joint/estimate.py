@@ -10,7 +10,7 @@ from uwlts.calibration.joint.parameters import Parameters
 from uwlts.calibration.joint.residuals import STEP, STRIPE, TARGET, Residuals, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import SCANNED, SurfaceScanEvidence
 from uwlts.errors import CalibrationError
-from uwlts.fitting.least_squares import DEFAULT_K, MAD_TO_STD, robust_std
+from uwlts.fitting.least_squares import DEFAULT_K, robust_std
 from uwlts.fitting.schur_least_squares import LocalPrior, Observation, SchurFit, schur_least_squares
 from uwlts.model.parameter_keys import ParameterKey
 from uwlts.model.sensor import Uncertainty
@@ -193,17 +193,14 @@ def _fit(
 
     def model(group: int, global_values: np.ndarray, local: np.ndarray) -> Sequence[Observation | LocalPrior] | None:
         if group == len(evidence):
-            return _prior_observations(parameters, global_values)
+            return prior_observations(parameters, global_values)
         piece = evidence[group]
         parts = piece.residuals(parameters, global_values, local)
         if parts is None:
             return None
-        rows: list[Observation | LocalPrior] = []
-        for number, part in enumerate(parts):
-            used = slice(None) if left_out is None else ~left_out[group][number]
-            columns, scale = (part.values[:, None], part.by_global, part.by_local), noise[part.kind].effective_px()
-            values, by_global, by_local = (column[used] / scale for column in columns)
-            rows.append(Observation(values, by_global, by_local, part.local_columns))
+        used = [slice(None)] * len(parts) if left_out is None else [~mask for mask in left_out[group]]
+        pairs = zip(parts, used, strict=True)
+        rows = [part.weighted(noise[part.kind].effective_px(), kept) for part, kept in pairs]
         known = piece.known_before(local, uncertainty)
         return [*rows, known] if len(known.residuals) else rows
 
@@ -214,7 +211,7 @@ def _fit(
     return schur_least_squares(model, global_values, starts, **first, enough_rounds=_FIRST_ROUNDS)
 
 
-def _prior_observations(parameters: Parameters, global_values: np.ndarray) -> list[Observation]:
+def prior_observations(parameters: Parameters, global_values: np.ndarray) -> list[Observation]:
     """Return prior knowledge: of single parameters, and of many jointly from an earlier estimate."""
     std = parameters.prior_std()
     known = np.isfinite(std)
@@ -237,8 +234,9 @@ def _estimate_all_noise(
             common_px, bodies = np.concatenate([e.common_px for e in scans]), sum(e.surface.count for e in scans)
             result[kind] = add_common_error(result[kind], common_px, bodies=bodies)
         if kind in misfits:
-            per_image = float(np.mean([len(r.values) for r in of_kind]))
-            result[kind] = add_misfit(result[kind], per_image=per_image)
+            # With an incomplete model, the residuals of an image count as one.
+            noise, per_image = result[kind], float(np.mean([len(r.values) for r in of_kind]))
+            result[kind] = replace(noise, besides=noise.besides + max(per_image - noise.together, 0.0))
     return result
 
 
@@ -250,15 +248,10 @@ def outliers(residuals: Residuals, noise: Noise) -> np.ndarray:
     return large
 
 
-def outlier_limit(values: np.ndarray) -> float:
-    """Return the absolute value beyond which values are outliers: five robust standard deviations."""
-    return DEFAULT_K * MAD_TO_STD * float(np.median(np.abs(values)))
-
-
 def estimate_noise(kind: str, residuals: Sequence[Residuals], points: Sequence[np.ndarray]) -> Noise:
     """Estimate the noise of all residuals of a kind; ``points`` (N, 3) of each placement are used for target points."""
     values = np.concatenate([r.values for r in residuals])
-    limit = outlier_limit(values)
+    limit = DEFAULT_K * robust_std(values)
     kept = np.abs(values) <= limit
     sigma = float(np.sqrt(np.mean(values[kept] ** 2))) if kept.any() else limit / DEFAULT_K
     if sigma < _FINEST_PX:
@@ -277,11 +270,6 @@ def add_common_error(noise: Noise, common_px: np.ndarray, *, bodies: float) -> N
     """Add a common error of all points of a scanned body, with standard uncertainties ``common_px`` (N,)."""
     points_per_body, common = len(common_px) / bodies, float(np.mean(common_px**2))
     return Noise(noise.sigma_px, noise.together, points_per_body * common / noise.sigma_px**2)
-
-
-def add_misfit(noise: Noise, *, per_image: float) -> Noise:
-    """Return the noise with an incomplete model: the ``per_image`` residuals of an image count as one."""
-    return replace(noise, besides=noise.besides + max(per_image - noise.together, 0.0))
 
 
 def _point_variance_factor(values: np.ndarray, places: np.ndarray, kept: np.ndarray, sigma: float) -> float:

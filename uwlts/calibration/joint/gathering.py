@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pydantic import JsonValue
 
-from uwlts.calibration.camera.camera_parameters import DISTORTION, CameraOptions, Placement, placements
+from uwlts.calibration.camera.camera_parameters import DISTORTION, CameraOptions
 from uwlts.calibration.camera.lens import LensChoice
 from uwlts.calibration.capture_evidence import (
     AirEvidence,
@@ -24,6 +24,7 @@ from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard, p
 from uwlts.model.calibration import CameraModel, WindowModel
 from uwlts.model.parameter_keys import LensParameter, MediumIndex, ParameterKey, StageParameter, StepHeight
 from uwlts.model.sensor import Medium, Sensor, Uncertainty
+from uwlts.model.stripe import CaptureStripes
 from uwlts.optics.brightness import fit_brightness_slopes, select_sharp_lines
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import Capture
@@ -53,24 +54,17 @@ class Series:
     approaching: bool | None
     directions: Sequence[tuple[float, float, float]] = ()
 
-    def placements(self, *, free: bool) -> list[Placement]:
-        """Return placements: images joined by the stage's motion, or single images if ``free``."""
-        return placements(self.found.images, approaching=None if free else self.approaching)
-
 
 @dataclass(frozen=True, eq=False)
 class ScanStripes:
-    """Stripe centres (N,) of a scan, the stage's positions (F,), and the described object.
+    """Stripe centres (N,) of a scan as ``found``, the stage's positions (F,), and the described object.
 
     ``blur_px`` (N,) is the possible shift by blur, ``slopes`` (N,) are those of the brightness
     (`uwlts.optics.brightness`).
     """
 
     source: str
-    frame: np.ndarray
-    line: np.ndarray
-    centre_px: np.ndarray
-    width_px: np.ndarray
+    found: CaptureStripes
     blur_px: np.ndarray
     slopes: np.ndarray
     stage_mm: np.ndarray
@@ -85,11 +79,11 @@ class ScanStripes:
     def remove_images(self, sources: Collection[str]) -> "ScanStripes | None":
         """Remove images by name; return None if too few would remain."""
         left_out = np.array([name in sources for name in self.image_names()])
-        seen = np.unique(self.frame)
+        seen = np.unique(self.found.frame)
         if not _remain_enough(int(np.sum(~left_out[seen])), len(seen)):
             return None
-        kept, lines = ~left_out[self.frame], ("frame", "line", "centre_px", "width_px", "blur_px", "slopes")
-        return replace(self, **{name: getattr(self, name)[kept] for name in lines})
+        kept = ~left_out[self.found.frame]
+        return replace(self, found=self.found[kept], blur_px=self.blur_px[kept], slopes=self.slopes[kept])
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,10 +101,6 @@ class Gathered:
     scans: list[ScanStripes]
     provenance: dict[str, JsonValue]
     warnings: list[str]
-
-    def views(self) -> list[ViewMedium]:
-        """Return window state and medium of each series of target images, each scan and each step image."""
-        return [s.view for s in [*self.series, *self.scans]] + [view for _, view in self.steps]
 
     def remove_images(self, sources: Collection[str]) -> "Gathered | None":
         """Remove images by name; return None if too few of a series, the steps or a scan would remain."""
@@ -203,10 +193,7 @@ def scan_stripes(capture: Capture, view: ViewMedium, *, stripe: StripeSettings) 
     stage = capture.stage_mm[:]
     return ScanStripes(
         source=capture.path.name,
-        frame=found.frame,
-        line=found.line,
-        centre_px=found.centre_px,
-        width_px=found.width_px,
+        found=found,
         blur_px=blur,
         slopes=fit_brightness_slopes(found.frame, found.line, found.amplitude, stage, capture.exposure_ms[:]),
         stage_mm=stage,

@@ -9,7 +9,7 @@ from typing import assert_never
 import cv2
 import numpy as np
 
-from uwlts.calibration.camera.camera_parameters import DISTORTION, CameraOptions, Intrinsics, Placement
+from uwlts.calibration.camera.camera_parameters import DISTORTION, CameraOptions, Intrinsics, Placement, placements
 from uwlts.calibration.camera.target_poses import (
     CameraSolution,
     placement_pose,
@@ -169,7 +169,8 @@ def estimate_series_start(
     for part in series:
         seen_by = _Viewpoint(intrinsics.model(lens), window, indices, part.view)
         staged = not free and part.approaching is not None
-        for placement in part.placements(free=free):
+        # Images are joined by the stage's motion, unless poses are free.
+        for placement in placements(part.found.images, approaching=None if free else part.approaching):
             pose = seen_by.pose(placement)
             piece = _build_target_evidence(part, placement, seen_by, pose, sensor, staged=staged)
             start.evidence.append(piece)
@@ -347,10 +348,10 @@ def build_scan_evidence(
 
     Raises EvaluationError if the points do not show the described object.
     """
-    line, centre, direction = stripes.line, stripes.centre_px, stripes.stage_direction
+    found, direction = stripes.found, stripes.stage_direction
     across = 1 if start.stripe_along == "width" else 0
-    pixels = stack_pixels(line, centre, stripe_along=start.stripe_along)
-    stage_mm = stripes.stage_mm[stripes.frame]
+    pixels = stack_pixels(found.line, found.centre_px, stripe_along=start.stripe_along)
+    stage_mm = stripes.stage_mm[found.frame]
 
     def reconstructed(pixels: np.ndarray, stage_mm: np.ndarray) -> np.ndarray:
         return reconstruct_pixels(
@@ -358,11 +359,11 @@ def build_scan_evidence(
         ).points_mm
 
     on_sheet = reconstructed(pixels, stage_mm)
-    sheet = IlluminatedPoints.from_calibration(start, sensor, line, centre, medium_index=medium_index)
-    beside = sheet.brightness_shift(stripes.width_px, stripes.slopes, stage_direction=tuple(direction.tolist()))
+    sheet = IlluminatedPoints.from_calibration(start, sensor, found.line, found.centre_px, medium_index=medium_index)
+    beside = sheet.brightness_shift(found.width_px, stripes.slopes, stage_direction=tuple(direction.tolist()))
     points = on_sheet + beside
     # Exclude rims, where few points are left and are unreliable, and fast changes of brightness.
-    often = np.bincount(stripes.frame)[stripes.frame] >= _FEWEST_POINTS
+    often = np.bincount(found.frame)[found.frame] >= _FEWEST_POINTS
     good = often & (np.abs(stripes.slopes) < _STEEPEST) & np.isfinite(points).all(axis=1)
     if not good.any():
         raise EvaluationError(f"no image shows it on {_FEWEST_POINTS} sharp, evenly bright profile lines")
@@ -371,7 +372,7 @@ def build_scan_evidence(
     transform = start.object_transform()
     used, surface, local = _fit_surface(stripes.artefact, points[there], transform, sizes_known=sizes_known)
     kept = there[used]
-    frames, frame = np.unique(stripes.frame[kept], return_inverse=True)
+    frames, frame = np.unique(found.frame[kept], return_inverse=True)
     rotation, position_mm = transform[:3, :3], stripes.stage_mm[frames]
     # Shift of the points by light from beside the sheet, as pixels across the stripe.
     per_px = reconstructed(pixels[kept] + np.eye(2)[across], stage_mm[kept]) - on_sheet[kept]

@@ -1,7 +1,8 @@
 """Images that may be added to a joint calibration, with the reduction of the uncertainty of lengths by each."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -9,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from uwlts.calibration.camera.camera_parameters import Placement, pose_values
 from uwlts.calibration.joint.estimate import Evidence, Noise, add_common_error
 from uwlts.calibration.joint.observability import (
+    SheetRegion,
     compute_mesh_lengths,
     find_weaknesses,
     format_weaknesses,
@@ -16,14 +18,14 @@ from uwlts.calibration.joint.observability import (
     project_sheet_points,
     read_region_estimate,
 )
-from uwlts.calibration.joint.parameters import Prior, ViewMedium
+from uwlts.calibration.joint.parameters import Prior
 from uwlts.calibration.joint.residuals import TARGET, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, ScannedSpheres, SurfaceScanEvidence
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, require_joint
 from uwlts.fitting.next_observation import Candidate, CovarianceRoot, Forecast, eliminate_others, rank_candidates
+from uwlts.fitting.schur_least_squares import normal_equations
 from uwlts.model.calibration import Calibration, rigid_transform
 from uwlts.model.parameter_keys import ParameterKey, StageParameter, StepHeight
-from uwlts.model.sensor import Uncertainty
 from uwlts.optics.triangulation import sheet_surface
 from uwlts.stripe.capture_stripes import FEWEST_LINES
 from uwlts.targets import Target, parse_target
@@ -31,12 +33,12 @@ from uwlts.targets import Target, parse_target
 WHOLE_VOLUME = "lengths over the volume"
 _FEWEST_POINTS = 20  # target points in view: fewer determine the pose of an image poorly
 _SAMPLES = 400  # points of a curve, enough to interpolate a point on each profile line of its image
-STEP_MM = 20.0
+_STEP_MM = 20.0
 """Height of the step standard, as in the thesis."""
 _STEP_HALF_MM = 30.0  # half the length of its upper face along the stripe
 _STEP_REACH_MM = 70.0  # extent of its lower faces from the middle
-SPHERES = 2  # of the standard that an image of a sphere pair shows
-SPHERE_MM = 30.0
+_SPHERES = 2  # of the standard that an image of a sphere pair shows
+_SPHERE_MM = 30.0
 """Diameter of the spheres, as in the thesis."""
 _SPHERES_APART_MM = 60.0  # spacing of their centres, twice the diameter
 _SPHERE_IMAGES = 29  # images of their scan, some 1 mm apart; more are redundant
@@ -58,36 +60,24 @@ _TILTS = {
 """Rotations about the camera's x and y axes."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class CandidateShot(Candidate):
-    """Possible image or scan, with its view, and for a target ``T_camera_target`` (4, 4)."""
-
-    view: ViewMedium
-    pose: np.ndarray | None = None
-
-
 _Simulated = tuple[StoredEstimate, Evidence, np.ndarray]
 """The estimate (with parameters that the image adds), the image's evidence, and its local parameters."""
 
 
-def rank_next_shots(calibration: Calibration) -> list[Forecast[CandidateShot]]:
+def rank_next_shots(calibration: Calibration) -> list[Forecast[Candidate]]:
     """Return possible further images, the most helpful one first; empty if the evidence covers no area.
 
-    They are compared by the standard uncertainty of lengths over the volume (root mean square), mm.
+    They are compared by the standard uncertainty of lengths over the volume (root mean square), mm. Their poses are
+    ``T_camera_object``.
 
     Raises CalibrationError if the calibration contains no joint estimate, or a damaged one.
     """
     region = next(iter(list_regions(calibration)), None)
     if region is None or not region.has_area():
         return []
-    known, uncertainty = read_region_estimate(calibration, region), calibration.origin().known_before
-    low, high = region.outline_mm[:, 1].min(), region.outline_mm[:, 1].max()
-    depths = {words: float(low + share * (high - low)) for words, share in _PLACES.items()}
-    return rank_candidates(
-        CovarianceRoot.from_covariance(known.covariance),
-        compute_mesh_lengths(known, region).by_parameters,
-        _generate_shots(known, region.name, depths, uncertainty),
-    )
+    known = read_region_estimate(calibration, region)
+    lengths = compute_mesh_lengths(known, region).by_parameters
+    return rank_candidates(CovarianceRoot.from_covariance(known.covariance), lengths, _generate_shots(known, region))
 
 
 def advice_lines(calibration: Calibration) -> list[str]:
@@ -99,32 +89,30 @@ def advice_lines(calibration: Calibration) -> list[str]:
     if region is None or not region.has_area():
         return ["the stripes of the evidence cover no area: the uncertainty of measured lengths is not known"]
     known = read_region_estimate(calibration, region)
-    lines = format_weaknesses(
-        find_weaknesses(compute_mesh_lengths(known, region), known.parameters.keys, known.covariance)
-    )
+    weak = find_weaknesses(compute_mesh_lengths(known, region), known.parameters.keys, known.covariance)
     best = rank_next_shots(calibration)[:1]
-    return [*lines, *(f"next: {forecast.advice(WHOLE_VOLUME)}" for forecast in best)]
+    return [*format_weaknesses(weak), *(f"next: {forecast.advice(WHOLE_VOLUME)}" for forecast in best)]
 
 
-def _generate_shots(
-    known: StoredEstimate, medium: str, depths: Mapping[str, float], uncertainty: Uncertainty
-) -> Iterator[CandidateShot]:
-    """Generate the possible images with the information that they add."""
-    simulated: list[tuple[str, _Simulated | None, np.ndarray | None]] = [*_simulate_targets(known, medium, depths)]
+def _generate_shots(known: StoredEstimate, region: SheetRegion) -> Iterator[Candidate]:
+    """Generate images of the target, if the calibration used one, and of a step, and scans of two spheres."""
+    low, high = region.outline_mm[:, 1].min(), region.outline_mm[:, 1].max()
+    depths = {words: float(low + share * (high - low)) for words, share in _PLACES.items()}
+    shots = [*_simulate_targets(known, region.name, depths)]
     for words, depth in depths.items():
-        place = f"in {medium}, {words} (Z {depth:+.0f} mm),"
-        simulated.append((f"an image of a step {place}", _simulate_step(known, depth, uncertainty), None))
-        spheres = f"a scan of two spheres of {SPHERE_MM:g} mm {place}"
-        simulated.append((spheres, _simulate_spheres(known, depth, uncertainty), None))
-    for words, shot, pose in simulated:
-        if shot is not None and (added := _compute_information(shot, len(known.values), uncertainty)) is not None:
-            yield CandidateShot(words=words, information=added, view=shot[0].view, pose=pose)
+        place, pose = f"in {region.name}, {words} (Z {depth:+.0f} mm),", _pose(known.calibration, np.zeros(3), depth)
+        spheres = f"a scan of two spheres of {_SPHERE_MM:g} mm {place}"
+        shots += [(f"an image of a step {place}", pose, _simulate_step(known, depth))]
+        shots += [(spheres, pose, _simulate_spheres(known, depth))]
+    for words, pose, shot in shots:
+        if shot is not None and (added := _compute_information(shot, len(known.values))) is not None:
+            yield Candidate(words=words, information=added, pose=pose)
 
 
 def _simulate_targets(
     known: StoredEstimate, medium: str, depths: Mapping[str, float]
-) -> Iterator[tuple[str, _Simulated | None, np.ndarray]]:
-    """Generate descriptions, simulated images (None if impossible) and poses of the target."""
+) -> Iterator[tuple[str, np.ndarray, _Simulated | None]]:
+    """Generate descriptions, poses and simulated images (None if impossible) of the target."""
     described = known.calibration.origin().target
     if described is None:
         return
@@ -133,19 +121,20 @@ def _simulate_targets(
     in_air = [other.view for other in list_regions(known.calibration) if other.view.medium is None]
     if known.view.medium is not None and in_air:
         views["air"] = in_air[0]
-    for name, view in views.items():
+    middle = np.append(target.extent_mm.mean(axis=0), 0.0)
+    for (name, view), (where, depth), (tilt, turns) in product(views.items(), depths.items(), _TILTS.items()):
         through = " without the window" if known.calibration.window is not None and not view.window else ""
-        for where, depth in depths.items():
-            for tilt, turns in _TILTS.items():
-                pose = _pose(known.calibration, target, depth, turns)
-                words = f"an image of the target in {name}{through}, {where} (Z {depth:+.0f} mm), {tilt}"
-                words += "," if tilt == "square" else f" by {_TILT_DEG:g}°,"
-                yield words, _simulate_target(replace(known, view=view), target, pose), pose
+        pose = _pose(known.calibration, middle, depth, turns)
+        by = "" if tilt == "square" else f" by {_TILT_DEG:g}°"
+        words = f"an image of the target in {name}{through}, {where} (Z {depth:+.0f} mm), {tilt}{by},"
+        yield words, pose, _simulate_target(replace(known, view=view), target, pose)
 
 
-def _pose(calibration: Calibration, target: Target, depth_mm: float, turns: tuple[float, float]) -> np.ndarray:
-    """Return ``T_camera_target`` (4, 4) with the target's middle on the OCS's axis, tilted by ``turns``."""
-    frame, middle = calibration.object_transform(), np.append(target.extent_mm.mean(axis=0), 0.0)
+def _pose(
+    calibration: Calibration, middle: np.ndarray, depth_mm: float, turns: tuple[float, float] = (0.0, 0.0)
+) -> np.ndarray:
+    """Return ``T_camera_object`` (4, 4) with the object's middle (3,) on the OCS's axis, tilted by ``turns``."""
+    frame = calibration.object_transform()
     turn = Rotation.from_euler("XY", _TILT_DEG * np.array(turns), degrees=True).as_matrix() @ frame[:3, :3]
     return rigid_transform(turn, frame[:3, 3] + depth_mm * frame[:3, 2] - turn @ middle)
 
@@ -171,15 +160,16 @@ def _simulate_target(known: StoredEstimate, target: Target, pose: np.ndarray) ->
     return known, evidence, pose_values(pose)
 
 
-def _simulate_step(known: StoredEstimate, depth_mm: float, uncertainty: Uncertainty) -> _Simulated | None:
+def _simulate_step(known: StoredEstimate, depth_mm: float) -> _Simulated | None:
     """Simulate an image of a step standard with the lower face at a depth Z; None if too little is in view.
 
     The standard of the evidence is used if it contains one.
     """
     height = next((key for key in known.parameters.keys if isinstance(key, StepHeight)), None)
     if height is None:
-        height = StepHeight(STEP_MM)
-        known = _append_parameters(known, {height: Prior(STEP_MM, uncertainty.step_height_mm)})
+        height = StepHeight(_STEP_MM)
+        std = known.calibration.origin().known_before.step_height_mm
+        known = _append_parameters(known, {height: Prior(_STEP_MM, std)})
     y = np.linspace(-_STEP_REACH_MM, _STEP_REACH_MM, _SAMPLES)
     upper = np.abs(y) < _STEP_HALF_MM
     raised = depth_mm - known.parameters.value(known.values, height)
@@ -201,11 +191,12 @@ def _simulate_step(known: StoredEstimate, depth_mm: float, uncertainty: Uncertai
     return known, evidence, np.array([0.0, -frame[:3, 2] @ (frame[:3, 3] + frame[:3, 2] * depth_mm)])
 
 
-def _simulate_spheres(known: StoredEstimate, depth_mm: float, uncertainty: Uncertainty) -> _Simulated | None:
+def _simulate_spheres(known: StoredEstimate, depth_mm: float) -> _Simulated | None:
     """Simulate a scan along X of two spheres of unknown size at a depth Z; None if they are not in view."""
+    uncertainty = known.calibration.origin().known_before
     stage: dict[ParameterKey, Prior] = {key: Prior(0.0, uncertainty.stage_lean()) for key in SLOPES}
     known = _append_parameters(known, stage | {StageParameter.SCALE: Prior(0.0, uncertainty.stage_scale)})
-    frame, radius = known.calibration.object_transform(), SPHERE_MM / 2
+    frame, radius = known.calibration.object_transform(), _SPHERE_MM / 2
     positions = np.linspace(-0.9, 0.9, _SPHERE_IMAGES) * radius
     centres = np.array([(0.0, side * _SPHERES_APART_MM / 2, depth_mm) for side in (-1, 1)])
     turn = np.linspace(-_SEEN, _SEEN, _SAMPLES)
@@ -215,23 +206,23 @@ def _simulate_spheres(known: StoredEstimate, depth_mm: float, uncertainty: Uncer
     counts = [len(found) for found in pixels]
     if min(counts) < FEWEST_LINES:
         return None
-    unknown = np.full(SPHERES, np.inf)
-    sphere = np.repeat(np.tile(np.arange(SPHERES), _SPHERE_IMAGES), counts)
-    apart = np.full(SPHERES - 1, _SPHERES_APART_MM)
+    unknown = np.full(_SPHERES, np.inf)
+    sphere = np.repeat(np.tile(np.arange(_SPHERES), _SPHERE_IMAGES), counts)
+    apart = np.full(_SPHERES - 1, _SPHERES_APART_MM)
     evidence = SurfaceScanEvidence(
         view=known.view,
         pixels=np.vstack(pixels),
         across=known.across(),
         beside_mm=np.zeros((3, sum(counts))),
         common_px=np.full(sum(counts), _ON_SPHERES_PX),
-        surface=ScannedSpheres(np.full(SPHERES, SPHERE_MM), unknown, apart, unknown[1:], sphere),
-        frame=np.repeat(np.repeat(np.arange(_SPHERE_IMAGES), SPHERES), counts),
+        surface=ScannedSpheres(np.full(_SPHERES, _SPHERE_MM), unknown, apart, unknown[1:], sphere),
+        frame=np.repeat(np.repeat(np.arange(_SPHERE_IMAGES), _SPHERES), counts),
         stage_mm=positions,
         direction=frame[:3, 0],
         across_stage=frame[:3, 1:3].T,
         image=0,
     )
-    return known, evidence, np.append(centres @ frame[:3, :3].T + frame[:3, 3], np.zeros(SPHERES + len(positions)))
+    return known, evidence, np.append(centres @ frame[:3, :3].T + frame[:3, 3], np.zeros(_SPHERES + len(positions)))
 
 
 def _append_parameters(known: StoredEstimate, priors: Mapping[ParameterKey, Prior]) -> StoredEstimate:
@@ -282,7 +273,7 @@ def _mask_outside(known: StoredEstimate, pixels: np.ndarray) -> np.ndarray:
     return np.where(inside[:, None], pixels, np.nan)
 
 
-def _compute_information(shot: _Simulated, known: int, uncertainty: Uncertainty) -> np.ndarray | None:
+def _compute_information(shot: _Simulated, known: int) -> np.ndarray | None:
     """Return the information on the first ``known`` parameters that an image adds; None if a ray meets nothing.
 
     The noise is that of the same kind of residual, or of the noisiest stripe for a new kind.
@@ -298,13 +289,9 @@ def _compute_information(shot: _Simulated, known: int, uncertainty: Uncertainty)
     if isinstance(evidence, SurfaceScanEvidence):
         kind, surface = evidence.surface.kind, evidence.surface
         noise[kind] = add_common_error(noise[kind], evidence.common_px, bodies=surface.count)
-    count = len(estimate.values)
-    before = evidence.known_before(local_values, uncertainty).by_local
-    total = np.zeros((count + len(local_values),) * 2)
-    total[known:count, known:count] = np.diag(estimate.parameters.prior_std()[known:] ** -2.0)
-    total[count:, count:] = (before.T @ before).toarray()
-    for part in parts:
-        rows = np.hstack([part.by_global, part.by_local])
-        at = np.r_[0:count, count + part.local_columns]
-        total[np.ix_(at, at)] += noise[part.kind].effective_px() ** -2 * np.einsum("ni,nj->ij", rows, rows)
+    rows = [part.weighted(noise[part.kind].effective_px()) for part in parts]
+    before = evidence.known_before(local_values, estimate.calibration.origin().known_before)
+    total = normal_equations([*rows, before], len(estimate.values), len(local_values))[0][:-1, :-1]
+    added = np.arange(known, len(estimate.values))
+    total[added, added] += estimate.parameters.prior_std()[added] ** -2.0
     return eliminate_others(total, known)

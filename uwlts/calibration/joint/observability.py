@@ -8,7 +8,7 @@ import numpy as np
 from uwlts.calibration.joint.parameters import ViewMedium
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, read_original_estimate, require_joint
 from uwlts.errors import CalibrationError
-from uwlts.fitting.next_observation import find_weak_directions
+from uwlts.fitting.next_observation import CovarianceRoot
 from uwlts.model.calibration import Calibration
 from uwlts.model.parameter_keys import ParameterInFile, ParameterKey
 from uwlts.model.sensor import Medium
@@ -115,14 +115,11 @@ def sample_sheet(known: StoredEstimate, at_mm: np.ndarray) -> SheetSamples:
 
     Raises CalibrationError if a point is outside the camera's view.
     """
-    pixels = project_sheet_points(known, at_mm)
-    found = None
-    if np.isfinite(pixels).all():
-        found = known.parameters.stripe_points(known.values, known.view, pixels, across=known.across())
+    pixels, across = project_sheet_points(known, at_mm), known.across()
+    found = known.triangulate(pixels[:, 1 - across], pixels[:, across]) if np.isfinite(pixels).all() else None
     if found is None:
         raise CalibrationError("the calibration's covered volume is outside the camera's view: calibrate again")
-    by = np.einsum("ji,njp->nip", known.calibration.object_transform()[:3, :3], found.by)
-    return SheetSamples(at_mm, by[:, :, 1:], by[:, :, 0])
+    return SheetSamples(at_mm, found[1][:, :, 1:], found[1][:, :, 0])
 
 
 def project_sheet_points(known: StoredEstimate, at_mm: np.ndarray) -> np.ndarray:
@@ -150,6 +147,11 @@ def compute_mesh_lengths(known: StoredEstimate, region: SheetRegion) -> Lengths:
 
 _NEGLIGIBLE_MM = 1e-3  # far below the noise of a scanned point
 _AXIS_COSINE = 0.9  # within 26 deg, a length is along an axis
+_MOST = 3  # largest number of parameters or directions to list
+_LEAST_SHARE = 0.1  # fraction of the variance of all lengths; a direction with less is not listed
+_NAMED_SHARE = 0.4  # fraction of the most important parameter's contribution; others are not listed with it
+_CAUSE_SHARE = 0.3  # fraction of a direction that knowledge of one parameter must determine to count as its cause
+_CONFUSED = 0.3  # smallest correlation eigenvalue below which parameters are inseparable: correlation of 0.7 for two
 
 
 @dataclass(frozen=True)
@@ -181,24 +183,45 @@ class Weakness:
 def find_weaknesses(lengths: Lengths, keys: Sequence[ParameterKey], covariance: np.ndarray) -> list[Weakness]:
     """Return at most three weakest directions; empty if every length is certain to a micrometre.
 
-    ``lengths`` are those over the volume; ``covariance`` is (P, P).
+    A direction is an independent change of the parameters by one standard deviation. It is omitted if it adds less than
+    a tenth of the variance of all lengths. ``lengths`` are those over the volume; ``covariance`` is (P, P).
     """
-    found = []
-    for weak in find_weak_directions(covariance, lengths.by_parameters, least=_NEGLIGIBLE_MM):
-        worst = int(np.argmax(np.abs(weak.changes)))
+    root, std, found = CovarianceRoot.from_covariance(covariance).root, np.sqrt(np.diag(covariance)), []
+    _, sizes, parts = np.linalg.svd(lengths.by_parameters @ root, full_matrices=False)
+    for size, part in zip(sizes[:_MOST], parts, strict=False):
+        direction = root @ part
+        changes = np.abs(lengths.by_parameters @ direction)
+        worst = int(np.argmax(changes))
+        if size**2 < _LEAST_SHARE * np.sum(sizes**2) or changes[worst] < _NEGLIGIBLE_MM:
+            break
+        named = _select_main_parameters(lengths.by_parameters, direction, std)
+        correlation = covariance[np.ix_(named, named)] / np.outer(std[named], std[named])
         start, end = lengths.ends_mm[worst]
         along_y, along_z = np.abs(end - start) / np.linalg.norm(end - start) > _AXIS_COSINE
         found.append(
             Weakness(
-                parameters=tuple(keys[place] for place in weak.parameters),
-                confused=weak.confused,
-                cost_mm=float(abs(weak.changes[worst])),
+                parameters=tuple(keys[place] for place in named),
+                confused=len(named) > 1 and bool(np.linalg.eigvalsh(correlation)[0] < _CONFUSED),
+                cost_mm=float(changes[worst]),
                 length_mm=float(lengths.length_mm[worst]),
                 along="Z" if along_z else "Y" if along_y else "Y and Z",
                 depth_mm=float(max(start[1], end[1])),
             )
         )
     return found
+
+
+def _select_main_parameters(by_parameters: np.ndarray, direction: np.ndarray, std: np.ndarray) -> list[int]:
+    """Return the numbers of at most three main parameters of a direction (P,), the most important first.
+
+    The squared correlation of a parameter with the direction is the fraction of its variance that knowledge of the
+    parameter would remove. This includes parameters without an effect, such as a step height on lengths. If no single
+    parameter would help, the parameters with the largest effect on the lengths are returned.
+    """
+    share = np.divide(direction**2, std**2, out=np.zeros_like(std), where=std > 0)
+    if share.max() < _CAUSE_SHARE:
+        share = np.linalg.norm(by_parameters, axis=0) * np.abs(direction)
+    return [int(place) for place in np.argsort(-share) if share[place] >= _NAMED_SHARE * share.max()][:_MOST]
 
 
 def format_weaknesses(found: Sequence[Weakness]) -> list[str]:

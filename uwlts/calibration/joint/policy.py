@@ -22,15 +22,15 @@ from uwlts.calibration.joint.diagnose import (
 from uwlts.calibration.joint.estimate import Estimate, Evidence
 from uwlts.calibration.joint.gathering import Gathered
 from uwlts.calibration.joint.initial import find_odd_images
-from uwlts.calibration.joint.linearised_estimate import (
+from uwlts.calibration.joint.parameters import Parameters
+from uwlts.calibration.joint.problem import (
     HalfDifference,
+    JointProblem,
     compare_estimates,
-    keep_images,
+    joint_problem,
     mean_squares,
     split_in_halves,
 )
-from uwlts.calibration.joint.parameters import Parameters
-from uwlts.calibration.joint.problem import JointProblem, joint_problem
 from uwlts.calibration.joint.residuals import BENDS, STRETCH, STRIPE
 from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
@@ -80,7 +80,10 @@ def solve_and_check(problem: JointProblem) -> tuple[Estimate, Findings]:
     lens, window and stage, and would be barely visible in residuals. They are reported if there is no other
     contradiction.
     """
-    free = [_free_sizes(piece) for piece in problem.evidence]
+    free = [
+        replace(piece, surface=piece.surface.free_sizes()) if isinstance(piece, SurfaceScanEvidence) else piece
+        for piece in problem.evidence
+    ]
     result, against = _solve_with_observed_uncertainties(replace(problem, evidence=free))
     sizes, alone = compute_size_deviations(result, problem.evidence), not against.all_against() or bool(problem.misfits)
     doubts = [each.words() for each in sizes if each.doubtful()]
@@ -96,10 +99,6 @@ def solve_and_check(problem: JointProblem) -> tuple[Estimate, Findings]:
     if alone:
         against = replace(against, contradictions=wrong + against.contradictions)
     return result, against
-
-
-def _free_sizes(piece: Evidence) -> Evidence:
-    return replace(piece, surface=piece.surface.free_sizes()) if isinstance(piece, SurfaceScanEvidence) else piece
 
 
 @dataclass(frozen=True)
@@ -150,7 +149,7 @@ def _solve_with_observed_uncertainties(problem: JointProblem) -> tuple[Estimate,
     done if a single other parameter contradicts prior knowledge, nor again for an incomplete model.
     """
     result = problem.solve()
-    seen, sensor = PriorDeviations.from_estimate(result), problem.sensor
+    seen, sensor = PriorDeviations(deviations(result, least=0.0)), problem.sensor
     contradictions, doubts, factor = [], [], 1.0
     if problem.misfits or not seen.show_understated():
         against = check_consistency(result, problem.evidence, sensor=sensor)
@@ -205,9 +204,8 @@ def _compare_halves_of_form(problem: JointProblem, near: Estimate) -> list[HalfD
     """
     found = []
     for half in split_in_halves(problem.evidence):
-        evidence, local = keep_images(problem.evidence, near.local, half)
         with suppress(CalibrationError):
-            found.append(replace(problem, evidence=evidence, local=local, global_values=near.values).solve())
+            found.append(problem.with_images(half, near).solve())
     if len(found) < 2:
         return None
     std = problem.parameters.prior_std()
@@ -346,7 +344,7 @@ class _Attempt:
 
         An incomplete model also biases lens and poses, so that kinds of residuals that fit well are affected too.
         """
-        halves = self.problem.linearise(self.result).disagreements()
+        halves = [h for h in self.problem.linearise(self.result).compare_halves() if h.sigmas() > HALVES_APART]
         if not halves and not self.against.all_against():
             return None
         stated = self.problem.sensor
@@ -357,7 +355,7 @@ class _Attempt:
         result, against = solve_and_check(problem)
         result = result.no_surer_than(self.result)
         factor = float(np.median(list(result.std().values()) / np.sqrt(np.diag(self.result.covariance))))
-        said = [each.words() for each in halves[:_MOST_HALVES]]
+        said = [each.words() for each in sorted(halves, key=HalfDifference.sigmas, reverse=True)[:_MOST_HALVES]]
         said += [f"{words}; kept, as too many images are like this" for words in self.against.unfit.values()]
         said += [*self.against.misfits.values(), *self.against.judged]
         said.append(

@@ -1,13 +1,17 @@
-"""Problem of a joint calibration: all evidence with start values, and the parameters to estimate from it."""
+"""Problem of a joint calibration, its solution, and solutions from some of the images.
 
-from collections.abc import Mapping, Sequence
+An estimate contains the derivatives of all residuals. Near it, the estimate from fewer images follows from the normal
+equations of these images, without another iteration.
+"""
+
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
 
 from uwlts.calibration.camera.camera_parameters import CameraOptions
-from uwlts.calibration.joint.estimate import Estimate, Evidence, estimate
+from uwlts.calibration.joint.estimate import Estimate, Evidence, Noise, estimate, outliers, prior_observations
 from uwlts.calibration.joint.gathering import Gathered, build_priors, usual_distortion
 from uwlts.calibration.joint.initial import (
     build_all_scan_evidence,
@@ -15,16 +19,25 @@ from uwlts.calibration.joint.initial import (
     estimate_line_start,
     estimate_series_start,
 )
-from uwlts.calibration.joint.linearised_estimate import LinearisedEstimate
 from uwlts.calibration.joint.parameters import Parameters, Prior
-from uwlts.calibration.joint.residuals import TargetEvidence
+from uwlts.calibration.joint.residuals import TARGET, Residuals, StepProfileEvidence, TargetEvidence
+from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError
+from uwlts.fitting.schur_least_squares import invert_block, normal_equations
 from uwlts.model.calibration import WindowModel
 from uwlts.model.parameter_keys import LensParameter, ParameterKey, TargetParameter
-from uwlts.model.sensor import Sensor
+from uwlts.model.sensor import Sensor, Uncertainty
 
 _TRIAL_LINES = slice(None, None, 4)  # stripe pixels for the comparison of lenses: neighbours are correlated
+_FOLDS = 5  # as for the lens alone
+_CLIPPED = 5.0  # standard deviations; a larger error of prediction counts as this
+_SINGULAR = 1e-12  # eigenvalue of scaled normal equations below which the images do not determine a parameter
+_LEAST_SHARE = 1e-6  # of a parameter's variance: the least of a difference, for parameters without evidence
+_FEWEST_IMAGES = 4  # images of a target in two halves: two in each
+
+ImageId = tuple[int, int]
+"""Number of the piece of evidence, and of the image in it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +80,7 @@ class JointProblem:
         covariance = self.linearise(full).covariance_with(self.parameters.tied)
         return replace(result, covariance=covariance, formal_covariance=result.covariance)
 
-    def linearise(self, result: Estimate) -> LinearisedEstimate:
+    def linearise(self, result: Estimate) -> "LinearisedEstimate":
         """Return the normal equations of an estimate of this problem."""
         return LinearisedEstimate(result, self.evidence, self.sensor.uncertainty)
 
@@ -85,21 +98,34 @@ class JointProblem:
         } | usual_distortion(camera)
         parameters = replace(known, intrinsics=intrinsics, priors=priors)
         start = dict(zip(known.keys, near.values, strict=True))
-        start |= {LensParameter.FX: start.get(LensParameter.F, start.get(LensParameter.FX))}
-        start |= {LensParameter.F: start[LensParameter.FX]}
-        start |= {LensParameter.FY: start.get(LensParameter.FY, start[LensParameter.F])}
+        focal = start.get(LensParameter.F, start.get(LensParameter.FX))
+        start |= {LensParameter.F: focal, LensParameter.FX: focal, LensParameter.FY: start.get(LensParameter.FY, focal)}
         evidence = [e.with_stripes(_TRIAL_LINES) if isinstance(e, TargetEvidence) else e for e in self.evidence]
-        return replace(self.with_parameters(parameters, start), evidence=evidence, local=near.local)
-
-    def with_parameters(self, parameters: Parameters, start: Mapping[ParameterKey, float]) -> Self:
-        """Return the problem with other parameters; those without a start value begin at zero."""
         values = np.array([start.get(key, 0.0) for key in parameters.keys])
-        return replace(self, parameters=parameters, global_values=values)
+        return replace(self, parameters=parameters, evidence=evidence, global_values=values, local=near.local)
+
+    def with_images(self, wanted: Collection[ImageId], near: Estimate) -> Self:
+        """Return the problem with the wanted images of targets and steps, and all scans, near an estimate."""
+        kept: list[tuple[Evidence, np.ndarray]] = []
+        for number, (piece, start) in enumerate(zip(self.evidence, near.local, strict=True)):
+            if isinstance(piece, TargetEvidence):
+                images = [image for image in np.unique(piece.placement.image).tolist() if (number, image) in wanted]
+                if not images:
+                    continue
+                piece = piece.with_images(images)
+                if piece.staged:
+                    start = np.append(start[:8], np.zeros(len(piece.images())))
+            elif isinstance(piece, StepProfileEvidence) and (number, piece.image) not in wanted:
+                continue
+            kept.append((piece, start))
+        evidence, local = [piece for piece, _ in kept], [start for _, start in kept]
+        return replace(self, evidence=evidence, local=local, global_values=near.values)
 
 
 def joint_problem(gathered: Gathered, *, options: CalibrationOptions) -> JointProblem:
     """Build the problem from the captures, with start values; errors as `calibrate_jointly`."""
-    sensor, views = gathered.sensor, gathered.views()
+    sensor = gathered.sensor
+    views = [part.view for part in (*gathered.series, *gathered.scans)] + [view for _, view in gathered.steps]
     if not gathered.series:
         raise CalibrationError("no capture shows a target; joint calibration needs one in air or in water")
     bare = next((v.medium for v in views if v.medium is not None and not v.window and set(views) != {v}), None)
@@ -136,3 +162,196 @@ def joint_problem(gathered: Gathered, *, options: CalibrationOptions) -> JointPr
         diameter_mm=gathered.series[0].found.target.circle_diameter_mm if options.correct_circles else None,
         warnings=[*gathered.warnings, *left_out, *missed],
     )
+
+
+HeldOut = Sequence[tuple[np.ndarray, np.ndarray]]
+"""Predicted residuals of each held-out image, px, and their kinds."""
+
+
+def mean_squares(held: HeldOut, noise: dict[str, Noise]) -> np.ndarray:
+    """Return the mean square (F,) of each held-out image's errors relative to a noise, with clipped outliers.
+
+    An image whose points are all outliers of the estimate counts as clipped.
+    """
+    found = []
+    for values, kinds in held:
+        if not len(values):
+            found.append(_CLIPPED**2)
+            continue
+        sigma = np.array([noise[kind].sigma_px for kind in kinds])
+        weight = np.array([noise[kind].sigma_px / noise[kind].effective_px() for kind in kinds]) ** 2
+        squares = np.minimum(np.square(values / sigma), _CLIPPED**2)
+        found.append(float(np.sum(weight * squares) / np.sum(weight)))
+    return np.array(found)
+
+
+@dataclass(frozen=True)
+class HalfDifference:
+    """Estimates of a parameter from two halves of the images, and the standard uncertainty of their difference."""
+
+    key: ParameterKey
+    one: float
+    other: float
+    std: float
+
+    def sigmas(self) -> float:
+        """Return the difference in its standard uncertainties."""
+        return abs(self.one - self.other) / self.std
+
+    def words(self) -> str:
+        """Describe the disagreement."""
+        quantity = self.key.quantity
+        one, other = (quantity.format_with_std(value, self.std / np.sqrt(2.0)) for value in (self.one, self.other))
+        return f"two halves of the images disagree: {quantity.words} is {one} and {other}"
+
+
+class LinearisedEstimate:
+    """Normal equations of an estimate, for each image of targets and steps; scans belong to all subsets."""
+
+    def __init__(self, result: Estimate, evidence: Sequence[Evidence], uncertainty: Uncertainty):
+        self._result, self._count, self._halves = result, len(result.values), split_in_halves(evidence)
+        self._prior_of = [
+            normal_equations([piece.known_before(local, uncertainty)], self._count, len(local))[0]
+            for piece, local in zip(evidence, result.local, strict=True)
+        ]
+        self._parts: dict[ImageId, list[tuple[Residuals, np.ndarray]]] = {}
+        for number, parts in enumerate(result.residuals):
+            for part in parts:
+                used = ~outliers(part, result.noise[part.kind])
+                self._parts.setdefault((number, part.image), []).append((part, used))
+        self._normal = {image: self._sum_products(image) for image in self._parts}
+        self._targets = [image for image in self._parts if isinstance(evidence[image[0]], TargetEvidence)]
+        self._shared = [image for image in self._parts if isinstance(evidence[image[0]], SurfaceScanEvidence)]
+        self._prior = normal_equations(prior_observations(result.parameters, result.values), self._count, 0)[0]
+
+    def _sum_products(self, image: ImageId) -> np.ndarray:
+        noise, size = self._result.noise, len(self._prior_of[image[0]]) - self._count - 1
+        rows = [part.weighted(noise[part.kind].effective_px(), used) for part, used in self._parts[image]]
+        return normal_equations(rows, self._count, size)[0]
+
+    def _reduce(self, chosen: Collection[ImageId]) -> tuple[np.ndarray, dict[int, np.ndarray]]:
+        """Return the normal equations (P + 1, P + 1) of chosen images and prior knowledge, the gradient last.
+
+        Local parameters are eliminated. The second result gives their step, -B @ (step, 1), by a matrix B (b, P + 1).
+        """
+        p, total, backwards = self._count, self._prior.copy(), {}
+        keep, sums = np.r_[:p, -1], dict[int, np.ndarray]()
+        for number, image in sorted(chosen):
+            sums[number] = sums.get(number, self._prior_of[number]) + self._normal[number, image]
+        for number, product in sums.items():
+            border, inverse = product[p:-1, keep], _invert(product[p:-1, p:-1])
+            if inverse is None:
+                continue  # too few points of an image for its pose: it says nothing
+            backwards[number] = inverse @ border
+            total += product[np.ix_(keep, keep)] - border.T @ backwards[number]
+        return total, backwards
+
+    def predict(self) -> HeldOut:
+        """Predict each fifth of the target images, with the stripes on them, from all other images.
+
+        The pose of a held-out image is that of its placement, or fitted to its target points if it was held by hand.
+
+        Raises
+        ------
+        CalibrationError
+            The other images do not determine the parameters, or too few images show a target.
+        """
+        folds, found = min(_FOLDS, len(self._targets)), []
+        if folds < 2:
+            raise CalibrationError("too few images of a target to predict one from the others")
+        for fold in range(folds):
+            held = self._targets[fold::folds]
+            total, backwards = self._reduce(set(self._parts) - set(held))
+            inverse = _invert(total[:-1, :-1])
+            if inverse is None:
+                raise CalibrationError("without some of the images, the others do not determine the calibration")
+            step = -inverse @ total[:-1, -1]
+            for image in held:
+                columns: list[tuple[np.ndarray, ...]] = []
+                for part, used in self._parts[image]:
+                    by_local = np.zeros((len(used), len(self._result.local[image[0]])))
+                    by_local[:, part.local_columns] = part.by_local
+                    kind = np.full(len(used), part.kind)
+                    columns.append(tuple(c[used] for c in (part.values + part.by_global @ step, by_local, kind)))
+                moved, by_local, kind = (np.concatenate(column) for column in zip(*columns, strict=True))
+                if image[0] in backwards:
+                    local = -backwards[image[0]] @ np.append(step, 1.0)
+                else:
+                    points = kind == TARGET
+                    local = -np.linalg.lstsq(by_local[points], moved[points], rcond=None)[0]
+                found.append((moved + by_local @ local, kind))
+        return found
+
+    def compare_halves(self) -> list[HalfDifference]:
+        """Compare the parameters estimated from every second image and from the others; empty if not determined.
+
+        Prior knowledge and scans belong to both halves.
+        """
+        if len(self._targets) < _FEWEST_IMAGES:
+            return []
+        rest, values, covariances = self._reduce(self._shared)[0][:-1, :-1], [], []
+        for half in self._halves:
+            total, _ = self._reduce([*half, *self._shared])
+            if (inverse := _invert(total[:-1, :-1])) is None:
+                return []
+            values.append(self._result.values - inverse @ total[:-1, -1])
+            covariances.append(inverse)
+        return compare_estimates(self._result.parameters.keys, values, covariances, rest)
+
+    def covariance_with(self, tied: Collection[ParameterKey]) -> np.ndarray:
+        """Return the covariance (P, P) if ``tied`` parameters keep their prior value and uncertainty.
+
+        Their uncertainty is propagated to all others ("consider parameters": Schmidt, NASA TN D-1234, 1962).
+        """
+        keys = self._result.parameters.keys
+        held = np.array([key in tied for key in keys])
+        total = self._reduce(self._parts)[0][:-1, :-1]
+        inverse = _invert(total[np.ix_(~held, ~held)])
+        if inverse is None:
+            raise CalibrationError("the evidence does not determine the calibration")
+        variance = np.diag(np.square(self._result.parameters.prior_std()[held]))
+        by_held = np.eye(len(held))[:, held]
+        by_held[~held] = -inverse @ total[np.ix_(~held, held)]
+        covariance = by_held @ variance @ by_held.T
+        covariance[np.ix_(~held, ~held)] += inverse
+        return covariance
+
+
+def compare_estimates(
+    keys: Sequence[ParameterKey], values: Sequence[np.ndarray], covariances: Sequence[np.ndarray], shared: np.ndarray
+) -> list[HalfDifference]:
+    """Compare two estimates (P,) with covariances (P, P), both with the same prior knowledge ``shared`` (P, P).
+
+    With the normal matrices N of a half and S of the shared knowledge, an estimate is C (N a + S b), C = (N + S)^-1.
+    The difference of two has the covariance `C1 N1 C1 + C2 N2 C2 + D S D` with `D = C1 - C2`. Here `C N C = C - C S C`.
+    """
+    one, other = values
+    first, second = covariances
+    apart = first - second
+    covariance = first - first @ shared @ first + second - second @ shared @ second + apart @ shared @ apart
+    variance = np.maximum(np.diag(covariance), (_LEAST_SHARE * np.minimum(np.diag(first), np.diag(second))))
+    columns = zip(keys, one.tolist(), other.tolist(), np.sqrt(variance).tolist(), strict=True)
+    return [HalfDifference(*each) for each in columns]
+
+
+def _invert(matrix: np.ndarray) -> np.ndarray | None:
+    """Return the inverse of normal equations; None if they are singular."""
+    scale = np.sqrt(np.diag(matrix))
+    if not (scale > 0).all():
+        return None
+    try:
+        return invert_block(matrix / np.outer(scale, scale), least=_SINGULAR) / np.outer(scale, scale)
+    except np.linalg.LinAlgError:
+        return None
+
+
+def split_in_halves(evidence: Sequence[Evidence]) -> tuple[set[ImageId], set[ImageId]]:
+    """Return every second image, and the others; targets and steps apart."""
+    targets = [
+        (number, image)
+        for number, piece in enumerate(evidence)
+        if isinstance(piece, TargetEvidence)
+        for image in np.unique(piece.placement.image).tolist()
+    ]
+    steps = [(n, piece.image) for n, piece in enumerate(evidence) if isinstance(piece, StepProfileEvidence)]
+    return {*targets[::2], *steps[::2]}, {*targets[1::2], *steps[1::2]}

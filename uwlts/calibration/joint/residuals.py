@@ -14,7 +14,7 @@ from uwlts.calibration.camera.camera_parameters import Placement
 from uwlts.calibration.camera.target_poses import centre_offsets
 from uwlts.calibration.joint.parameters import Parameters, SheetPoints, ViewMedium
 from uwlts.fitting.local_surface import group_rows
-from uwlts.fitting.schur_least_squares import LocalPrior
+from uwlts.fitting.schur_least_squares import LocalPrior, Observation
 from uwlts.model.calibration import rigid_transform
 from uwlts.model.parameter_keys import ParameterKey, StageParameter, StepHeight, TargetParameter
 from uwlts.model.sensor import Uncertainty
@@ -47,6 +47,11 @@ class Residuals:
     local_columns: np.ndarray
     image: int
 
+    def weighted(self, sigma_px: float, used: np.ndarray | slice = slice(None)) -> Observation:
+        """Return the ``used`` residuals in standard deviations, with their derivatives."""
+        columns = (self.values[:, None], self.by_global, self.by_local)
+        return Observation(*(column[used] / sigma_px for column in columns), self.local_columns)
+
 
 @dataclass(frozen=True, eq=False)
 class Distances:
@@ -75,10 +80,6 @@ class StripeEvidence(ABC):
     across: int
     sources: Mapping[int, str] = field(default_factory=dict)
     predicted: np.ndarray | None = None
-
-    @abstractmethod
-    def residuals(self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray) -> list[Residuals] | None:
-        """Return the residuals of each image; None if a ray does not meet the object."""
 
     @abstractmethod
     def local_std(self, uncertainty: Uncertainty) -> np.ndarray:
@@ -238,6 +239,13 @@ class TargetEvidence(StripeEvidence):
     def with_stripes(self, chosen: np.ndarray | slice) -> Self:
         """Return the evidence with some of the stripe pixels only."""
         return replace(self, pixels=self.pixels[chosen], image=self.image[chosen], shifts_mm=self.shifts_mm[chosen])
+
+    def with_images(self, wanted: Sequence[int]) -> Self:
+        """Return the evidence of some images; stage positions still refer to the first image of all."""
+        here = np.isin(self.placement.image, wanted)
+        kept = {name: getattr(self.placement, name)[here] for name in ("points_mm", "shifts_mm", "pixels", "image")}
+        some = replace(self, placement=replace(self.placement, **kept))
+        return some.with_stripes(np.isin(self.image, wanted))
 
     def with_centres(
         self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray, diameter_mm: float
@@ -458,6 +466,7 @@ class StepProfileEvidence(StripeEvidence):
         return np.full(2, np.inf)
 
     def residuals(self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray) -> list[Residuals] | None:
+        """Return the residuals of the image; None if a ray does not meet the sheet."""
         points = self.on_sheet(parameters, global_values).points()
         if points is None:
             return None

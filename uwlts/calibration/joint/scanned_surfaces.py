@@ -1,6 +1,5 @@
 """Scans of spheres, planes and pipes as evidence: distances of points from the surface, and derivatives."""
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, Self
@@ -38,41 +37,16 @@ class Sizes:
         return self.off_mm[known] / std, self.by_local[known] / std[:, None]
 
 
-class Surface(ABC):
-    """One surface, or several of a kind, in the camera frame at the stage position 0.
-
-    ``kind`` is the name of its residuals, ``count`` the number of its bodies.
-    """
-
-    kind: ClassVar[str]
-    count: int = 1
-
-    @abstractmethod
-    def parameter_count(self) -> int:
-        """Return the number k of its local parameters, known before only by `sizes`."""
-
-    @abstractmethod
-    def distances(self, points: np.ndarray, local: np.ndarray) -> Distances:
-        """Return the distances of points (3, N) of the scan's pixels, in their order."""
-
-    def sizes(self, local: np.ndarray) -> Sizes:
-        """Return its described sizes; empty for a surface without a size."""
-        return Sizes((), np.empty(0), np.empty(0), np.empty(0), np.empty((0, len(local))))
-
-    def free_sizes(self) -> Self:
-        """Return the surface with unknown sizes."""
-        return self
-
-
 @dataclass(frozen=True, eq=False)
-class ScannedSpheres(Surface):
+class ScannedSpheres:
     """S spheres. Local parameters: centres in mm, then deviations of the diameters from ``diameters_mm`` (S,).
 
     ``spacings_mm`` (S - 1,) are the distances of consecutive centres. Standard uncertainties are infinite for unknown
-    sizes. ``sphere`` (N,) is the sphere of each pixel of the scan.
+    sizes. ``sphere`` (N,) is the sphere of each pixel of the scan. As all surfaces, they are given in the camera frame
+    at the stage position 0.
     """
 
-    kind: ClassVar[str] = "stripe on the spheres"
+    kind: ClassVar[str] = "stripe on the spheres"  # name of the residuals
 
     diameters_mm: np.ndarray
     diameter_std_mm: np.ndarray
@@ -80,13 +54,18 @@ class ScannedSpheres(Surface):
     spacing_std_mm: np.ndarray
     sphere: np.ndarray
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "count", len(self.diameters_mm))
+    @property
+    def count(self) -> int:
+        """Number of bodies."""
+        return len(self.diameters_mm)
 
+    @property
     def parameter_count(self) -> int:
+        """Number k of local parameters, known before only by `sizes`."""
         return 4 * self.count
 
     def distances(self, points: np.ndarray, local: np.ndarray) -> Distances:
+        """Return the distances of points (3, N) of the scan's pixels, in their order."""
         away = points - self._centres(local)[self.sphere].T
         distance = np.linalg.norm(away, axis=0)
         outward = away / distance
@@ -98,6 +77,7 @@ class ScannedSpheres(Surface):
         return Distances(distance - radius, outward, by_local)
 
     def sizes(self, local: np.ndarray) -> Sizes:
+        """Return the described sizes; empty for a surface without a size."""
         apart = np.diff(self._centres(local), axis=0)
         length = np.linalg.norm(apart, axis=1)
         by_local = np.zeros((self.count + len(length), len(local)))
@@ -117,6 +97,7 @@ class ScannedSpheres(Surface):
         )
 
     def free_sizes(self) -> Self:
+        """Return the surface with unknown sizes."""
         unknown = {name: np.full_like(getattr(self, name), np.inf) for name in ("diameter_std_mm", "spacing_std_mm")}
         return replace(self, **unknown)
 
@@ -125,7 +106,7 @@ class ScannedSpheres(Surface):
 
 
 @dataclass(frozen=True, eq=False)
-class ScannedPlane(Surface):
+class ScannedPlane:
     """Plane near the one through ``point_mm`` (3,) with the unit ``normal`` (3,).
 
     Local parameters: two slopes of its normal towards the unit vectors ``across`` (2, 3), and its distance in mm from
@@ -133,13 +114,12 @@ class ScannedPlane(Surface):
     """
 
     kind: ClassVar[str] = "stripe on the plane"
+    count: ClassVar[int] = 1
+    parameter_count: ClassVar[int] = 3
 
     point_mm: np.ndarray
     normal: np.ndarray
     across: np.ndarray
-
-    def parameter_count(self) -> int:
-        return 3
 
     def distances(self, points: np.ndarray, local: np.ndarray) -> Distances:
         normal, by_slopes = tilt_direction(self.normal, self.across, local[:2])
@@ -147,9 +127,15 @@ class ScannedPlane(Surface):
         by_local = np.column_stack([(by_slopes @ away).T, np.full(points.shape[1], -1.0)])
         return Distances(normal @ away - local[2], np.broadcast_to(normal[:, None], points.shape), by_local)
 
+    def sizes(self, local: np.ndarray) -> Sizes:
+        return Sizes((), np.empty(0), np.empty(0), np.empty(0), np.empty((0, len(local))))
+
+    def free_sizes(self) -> Self:
+        return self
+
 
 @dataclass(frozen=True, eq=False)
-class ScannedPipe(Surface):
+class ScannedPipe:
     """Cylinder near the one with the unit ``axis`` (3,) through ``point_mm`` (3,), seen from outside or inside.
 
     Local parameters: two shifts of its axis in mm at the point and two slopes, along the unit vectors ``across`` (2,
@@ -158,15 +144,14 @@ class ScannedPipe(Surface):
     """
 
     kind: ClassVar[str] = "stripe on the pipe"
+    count: ClassVar[int] = 1
+    parameter_count: ClassVar[int] = 5
 
     point_mm: np.ndarray
     axis: np.ndarray
     across: np.ndarray
     diameter_mm: float
     diameter_std_mm: float
-
-    def parameter_count(self) -> int:
-        return 5
 
     def sizes(self, local: np.ndarray) -> Sizes:
         described, std = np.array([self.diameter_mm]), np.array([self.diameter_std_mm])
@@ -187,6 +172,7 @@ class ScannedPipe(Surface):
         return Distances(distance - 0.5 * (self.diameter_mm + local[4]), outward, by_local)
 
 
+Surface = ScannedSpheres | ScannedPlane | ScannedPipe
 SCANNED = (ScannedSpheres.kind, ScannedPlane.kind, ScannedPipe.kind)
 """Names of residuals on these surfaces."""
 SLOPES = (StageParameter.SLOPE_1, StageParameter.SLOPE_2)
@@ -222,7 +208,7 @@ class SurfaceScanEvidence(StripeEvidence):
 
     def local_std(self, uncertainty: Uncertainty) -> np.ndarray:
         positions = np.full(len(self.stage_mm), uncertainty.stage_position_mm)
-        return np.append(np.full(self.surface.parameter_count(), np.inf), positions)
+        return np.append(np.full(self.surface.parameter_count, np.inf), positions)
 
     def known_before(self, local: np.ndarray, uncertainty: Uncertainty) -> LocalPrior:
         known = super().known_before(local, uncertainty)

@@ -12,11 +12,12 @@ from uwlts.calibration.mount.captured_profiles import CapturedProfiles, mount_co
 from uwlts.calibration.mount.hand_eye import mount_by_board
 from uwlts.calibration.mount.next_pose import NextPose, next_pose, require_determined, weaknesses
 from uwlts.calibration.mount.profile_evidence import (
-    SHAPES,
     Motion,
     MountState,
+    PlaneShape,
     Problem,
     Scatter,
+    SphereShape,
     from_sheet,
     thin,
     to_sheet,
@@ -201,7 +202,7 @@ class _Calibration:
     def __init__(self, evidence: MountEvidence, captured: CapturedProfiles | None = None) -> None:
         self.evidence = evidence
         self.captured = captured
-        self.shape = SHAPES[evidence.options.artefact](evidence.options.radius_mm)
+        self.shape = PlaneShape() if evidence.options.artefact == "plane" else SphereShape(evidence.options.radius_mm)
         self.rng = np.random.default_rng(0)
         most = max(_MOST_POINTS // len(evidence.profiles), 5 * LEAST_POINTS)
         self.rows = [thin(np.flatnonzero(np.isfinite(each).all(axis=1)), most) for each in evidence.profiles]
@@ -227,7 +228,8 @@ class _Calibration:
         for number, shape in enumerate(shapes):
             if shape is None:
                 self.reasons[number] = f"no {self.shape.kind} found in the profile"
-        self._require_enough()
+        seen = [shape for shape in shapes if shape is not None]
+        self._require_enough(len(seen))
         whole = Problem(
             self.profiles,
             _motion(self.evidence),
@@ -237,13 +239,11 @@ class _Calibration:
             self.evidence.options.time,
             self.evidence.options.axis is not None,
         )
-        kept = np.array([shape is not None for shape in shapes])
         problem = whole.select_detected(shapes)
-        seen = [shape for shape in shapes if shape is not None]
         towards = None if self.evidence.options.axis is None else SENSOR_AXES[self.evidence.options.axis]
         state = start(problem, seen, self.sheet, towards, self.rng)
         misfit = problem.rms_mm(state)
-        noise = float(np.median([shape.std_mm for shape in shapes if shape is not None]))
+        noise = float(np.median([shape.std_mm for shape in seen]))
         typical = max(float(np.median(misfit)), noise, 1e-6)
         self._require_small(typical, state, len(misfit))
         good = misfit < max(LARGEST_ROUGH * float(np.median(misfit)), 5 * noise)
@@ -255,18 +255,15 @@ class _Calibration:
             reach = 4 * float(np.hypot(np.hypot(scatter.point_mm, scatter.smooth_mm), 2 * scatter.pose_mm))
             state = found.state
             shapes = whole.detect_again(state, self.flat, reach, self.rng)
-            kept = np.array([shape is not None for shape in shapes])
             problem = whole.select_detected(shapes)
             good = np.ones(len(problem.points), dtype=bool)
-            self._require_enough(np.flatnonzero(kept))
+            self._require_enough(len(good))
 
         # Select the likelier estimate of two starts: this one, and unweighted least squares of all distances.
         starts = [(each, np.array(scatter)) for each in (state, problem.solve(state))]
-        found, good = settle_agreeing(
-            problem, starts, require=lambda good: self._require_enough(np.flatnonzero(kept)[good])
-        )
+        found, good = settle_agreeing(problem, starts, require=lambda good: self._require_enough(int(good.sum())))
         used, state = problem.select(good), found.state
-        numbers = np.flatnonzero(kept)
+        numbers = np.flatnonzero([shape is not None for shape in shapes])
         names = self.evidence.names
         for number in range(len(names)):
             if number in numbers[good]:
@@ -277,17 +274,15 @@ class _Calibration:
             else:
                 self.reasons.setdefault(number, f"no {self.shape.kind} found where the other poses show it")
         self._require_fit(used, found)
-        empty = [np.zeros(len(each), dtype=bool) for each in self.flat]
-        members = [own if shape is None else shape.members for own, shape in zip(empty, shapes, strict=True)]
+        points = zip(self.flat, shapes, strict=True)
+        members = [np.zeros(len(own), bool) if shape is None else shape.members for own, shape in points]
         return self._summary(used, found, members)
 
-    def _require_enough(self, numbers: np.ndarray | None = None) -> None:
-        poses, needed = len(self.profiles), self.shape.fewest_poses
-        usable = poses - len(self.reasons) if numbers is None else len(numbers)
-        if usable < needed:
+    def _require_enough(self, usable: int) -> None:
+        if usable < self.shape.fewest_poses:
             raise CalibrationError(
-                f"{usable} of {poses} profiles show the {self.shape.kind} and agree; at least {needed} are "
-                "needed. Record more poses, or check artefact, size and units"
+                f"{usable} of {len(self.profiles)} profiles show the {self.shape.kind} and agree; at least "
+                f"{self.shape.fewest_poses} are needed. Record more poses, or check artefact, size and units"
             )
 
     def _require_small(self, wrong_mm: float, state: MountState, poses: int) -> None:
@@ -303,7 +298,7 @@ class _Calibration:
         self._require_small(float(np.hypot(scatter.pose_mm, scatter.smooth_mm)), state, len(used.points))
         if self.shape.radius_mm is None:
             return
-        free = replace(used, shape=type(self.shape)())
+        free = replace(used, shape=SphereShape())
         other = RestrictedEstimate(free, state, estimate.scatter)
         at = free.size - free.scale - free.time - 1
         step, std = float(other.propagate(other.residuals[:, :, None])[at, 0]), float(np.sqrt(other.covariance[at, at]))
@@ -358,7 +353,7 @@ class _Calibration:
                 )
             )
         std, at = np.sqrt(np.diag(covariance)), 6 + self.shape.count
-        found = self.shape.to_stored(state.artefact, float(std[at - 1]) if self.shape.radius_unknown else None)
+        found = self.shape.to_stored(state.artefact, float(std[at - 1]) if self.shape.count == 4 else None)
         transform = rigid_transform(Rotation.from_matrix(state.rotation).as_matrix(), state.translation)
         weights = used.counts / used.counts.sum()
         return Mount(

@@ -87,7 +87,7 @@ def mount_by_board(
     middle = target.points_mm.mean(axis=0)
     rotations = Rotation.from_matrix([image.base_from_platform[:3, :3] for image in images])
     if axis is not None:
-        require_table(np.array([image.base_from_platform for image in images]), axis=axis)
+        require_table(np.array([image.base_from_platform for image in images]))
     elif missing := describe_missing_turns(rotations, least_rad=OPEN_RAD):
         raise CalibrationError(f"the poses do not determine the mount: {'; '.join(missing)}")
     problem = BoardEvidence(images, calibration.object_transform(), middle, axis is not None)
@@ -95,12 +95,11 @@ def mount_by_board(
     used, state = problem.select(kept), estimate.state
     _, position_mm, _ = estimate.scatter
     extent = float(np.linalg.norm(np.ptp(target.points_mm, axis=0)))
-    left_out = [image for image in images if image not in used.images]
     if position_mm > _NO_FIT * extent or 2 * len(used.images) < len(images):
         raise CalibrationError(
             f"no mount fits the images: the poses would have errors of {position_mm:.3g} mm (rms), with "
-            f"{len(left_out)} of {len(images)} images rejected. Check that the poses are T_base_platform, their "
-            "format, their units, and that they are in the order of the images"
+            f"{len(images) - len(used.images)} of {len(images)} images rejected. Check that the poses are "
+            "T_base_platform, their format, their units, and that they are in the order of the images"
         )
     if axis is not None and state[0][2, :3] @ SENSOR_AXES[axis] <= 0:
         raise CalibrationError(
@@ -110,8 +109,7 @@ def mount_by_board(
     covariance, share, factor = mount_covariance(
         estimate, used.free, state[0][:3, :3], known, lambda: used.residual_derivatives(state)
     )
-    turns = Rotation.from_matrix([image.base_from_platform[:3, :3] for image in used.images])
-    weak = weaknesses(covariance[:6, :6], turns, table=used.table)
+    weak = weaknesses(covariance[:6, :6], rotations[np.flatnonzero(kept)], table=used.table)
     require_determined(covariance, weak)
     found = {image.name: used.offsets_mm(state)[k] for k, image in enumerate(used.images)}
     others = [used.apply_step(state, step) for step, _ in estimate.without_each]
@@ -292,10 +290,6 @@ class BoardEvidence(GroupedEvidence[_State]):
     def _sensor_from_target(self) -> np.ndarray:
         return np.linalg.inv(self.camera_from_sensor) @ np.array([image.camera_from_target for image in self.images])
 
-    @property
-    def groups(self) -> int:
-        return len(self.images)
-
     def select(self, kept: np.ndarray) -> Self:
         return replace(self, images=[self.images[k] for k in np.arange(len(self.images))[kept]])
 
@@ -365,19 +359,12 @@ class BoardEvidence(GroupedEvidence[_State]):
         return self._by_images(state[0]) @ np.array([image.by_sensor for image in self.images])
 
     def jacobian(self, state: _State, step: np.ndarray | None = None) -> np.ndarray:
-        at = np.zeros(12) if step is None else self.free @ step
-
-        def residuals(every: np.ndarray) -> np.ndarray:
-            return self.residuals(self._apply_step(state, every))
-
-        return differences(residuals, at, np.tile(POSE_STEPS, 2)).reshape(-1, 6, 12) @ self.free
+        at, steps = np.zeros(self.size) if step is None else step, np.tile(POSE_STEPS, 2) @ self.free
+        return differences(partial(self.residuals, state), at, steps).reshape(-1, 6, self.size)
 
     def apply_step(self, state: _State, step: np.ndarray) -> _State:
-        return self._apply_step(state, self.free @ step)
-
-    def _apply_step(self, state: _State, step: np.ndarray) -> _State:
         """Shift and rotate the mount along the platform's axes, then the target about its middle."""
-        mount, common = state
+        (mount, common), step = state, self.free @ step
         turned = Rotation.from_rotvec(step[3:6]).as_matrix() @ mount[:3, :3]
         return rigid_transform(turned, mount[:3, 3] + step[:3]), move_about(common, self.middle, step[6:])
 

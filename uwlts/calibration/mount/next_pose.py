@@ -1,13 +1,13 @@
 """Weakly determined directions of a mount, missing motions, and the best pose to add."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, SphereShape, point_by_mount, to_sheet
+from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, SphereShape, to_sheet
 from uwlts.calibration.mount.restricted_likelihood import RestrictedEstimate
 from uwlts.errors import CalibrationError
 from uwlts.fitting.next_observation import Candidate, CovarianceRoot, rank_candidates
@@ -26,13 +26,6 @@ _UNKNOWN_MM = 100.0  # prior standard uncertainty of the mount's shift, so that 
 _UNKNOWN_RAD = 0.5  # the same for its rotation
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _CandidatePose(Candidate):
-    """Candidate with ``T_base_platform`` (4, 4)."""
-
-    pose: np.ndarray
-
-
 def next_pose(
     problem: Problem, state: MountState, scatter: Scatter, sheet: np.ndarray, names: list[str]
 ) -> NextPose | None:
@@ -47,8 +40,9 @@ def next_pose(
     prior = np.zeros(problem.size)
     prior[:3], prior[3:6] = _UNKNOWN_MM**-2.0, _UNKNOWN_RAD**-2.0
     information = RestrictedEstimate(problem, state, np.array(scatter)).information.sum(axis=0)
-    to_point = np.zeros((3, problem.size))
-    to_point[:, :6] = point_by_mount(state.rotation @ np.vstack(problem.points).mean(axis=0))
+    # Derivatives of the middle point, along the platform's axes, by shift and rotation of the mount.
+    middle, to_point = state.rotation @ np.vstack(problem.points).mean(axis=0), np.eye(3, problem.size)
+    to_point[:, 3:6] = np.cross(middle, np.eye(3))
     known = CovarianceRoot.from_information(information + np.diag(prior))
     ranked = rank_candidates(known, to_point, _generate_candidates(problem, state, scatter, sheet, names))
     if not ranked:
@@ -64,7 +58,7 @@ def next_pose(
 
 def _generate_candidates(
     problem: Problem, state: MountState, scatter: Scatter, sheet: np.ndarray, names: list[str]
-) -> Iterator[_CandidatePose]:
+) -> Iterator[Candidate]:
     """Generate rotations of the pose nearest to the middle of all, in both directions, for every candidate view."""
     rotations, positions = problem.motion(state.offset_s)
     every = Rotation.from_matrix(rotations)
@@ -91,7 +85,7 @@ def _generate_candidates(
                 f"turn the platform by {np.degrees(side * _TURN_RAD):+.0f} deg about its {'xyz'[axis]} axis from pose "
                 f"{names[nearest]}, with the {problem.shape.kind} {where}"
             )
-            yield _CandidatePose(words=words, information=added.information[0], pose=rigid_transform(turned, position))
+            yield Candidate(words=words, information=added.information[0], pose=rigid_transform(turned, position))
 
 
 def _views(problem: Problem, state: MountState, sheet: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, str]]:
@@ -143,19 +137,12 @@ def require_determined(covariance: np.ndarray, weak: Sequence[str], advised: Nex
 
 def weaknesses(covariance: np.ndarray, rotations: Rotation, *, table: bool) -> list[str]:
     """Describe weakly determined directions of a mount, and missing rotations of the platform."""
-    lines = []
+    lines, near = [], ": the artefact stays at nearly the same place in front of the sensor"
     limits = (
-        (_OPEN_MM, _LEAST_MM, "shift along", "mm", 1.0, ""),
-        (
-            OPEN_RAD,
-            _LEAST_RAD,
-            "turn about",
-            "deg",
-            np.degrees(1.0),
-            ": the artefact stays at nearly the same place in front of the sensor",
-        ),
+        (0, _OPEN_MM, _LEAST_MM, "shift along", "mm", 1.0, ""),
+        (3, OPEN_RAD, _LEAST_RAD, "turn about", "deg", np.degrees(1.0), near),
     )
-    for first, (limit, least, what, unit, size, why) in zip((0, 3), limits, strict=True):
+    for first, limit, least, what, unit, size, why in limits:
         variances, axes = np.linalg.eigh(covariance[first : first + 3, first : first + 3])
         stds = np.sqrt(np.maximum(variances, 0.0))
         for std, axis in zip(stds, axes.T, strict=True):

@@ -4,7 +4,6 @@ Each artefact is one class. Its start values are in `start_values`, its stored f
 of an artefact form an array; its parameters are steps from these values.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -17,89 +16,59 @@ from uwlts.calibration.mount.restricted_likelihood import GroupedEvidence, solve
 from uwlts.fitting.propagation import differences
 from uwlts.model.mount import PlaneFound, SphereFound
 from uwlts.optics.window import tilt_direction
-from uwlts.shapes.flat import perpendicular_to
+from uwlts.shapes.flat import perpendicular_to, unit_vectors
 from uwlts.shapes.profile_curves import LEAST_POINTS, Detection, find_arc, find_line
 from uwlts.storage.mount_files import Artefact
 
 
 @dataclass(frozen=True)
-class Shape(ABC):
-    """Kind of artefact; points (N, 3) are in the base frame."""
+class SphereShape:
+    """Sphere, in the base frame. Values: centre and radius (4,), mm; an unknown radius is the last parameter."""
 
     radius_mm: float | None = None
-    """Radius of a sphere, if known."""
 
-    kind: ClassVar[Artefact]
-    fewest_poses: ClassVar[int]
+    kind: ClassVar[Artefact] = "sphere"
+    fewest_poses: ClassVar[int] = 5
     """Number of poses that makes the problem overdetermined, with two or three equations per pose."""
-    flat: ClassVar[bool] = True
+    flat: ClassVar[bool] = False
     """True if profiles contain nearly straight lines, which determine the rotation of a pose."""
 
     @property
-    def radius_unknown(self) -> bool:
-        return not self.flat and self.radius_mm is None
-
-    @property
     def count(self) -> int:
-        """Number of parameters; an unknown radius is the last one."""
-        return 3 + self.radius_unknown
+        """Number of parameters."""
+        return 3 + (self.radius_mm is None)
 
-    @abstractmethod
     def find(self, points: np.ndarray, rng: np.random.Generator) -> Detection | None:
         """Find the artefact in a profile (N, 2), or return None."""
-
-    @abstractmethod
-    def apply_step(self, values: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """Return the values after a step (count,)."""
-
-    @abstractmethod
-    def distances(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Return signed distances (N,)."""
-
-    @abstractmethod
-    def normals(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Return derivatives (N, 3) of the distances by the points."""
-
-    @abstractmethod
-    def derivatives(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Return derivatives (N, count) of the distances by the parameters."""
-
-    @abstractmethod
-    def to_stored(self, values: np.ndarray, radius_std_mm: float | None) -> SphereFound | PlaneFound:
-        """Return the stored form of the artefact."""
-
-
-class SphereShape(Shape):
-    """Values: centre and radius (4,)."""
-
-    kind, fewest_poses, flat = "sphere", 5, False
-
-    def find(self, points: np.ndarray, rng: np.random.Generator) -> Detection | None:
         return find_arc(points, self.radius_mm, rng)
 
     def apply_step(self, values: np.ndarray, step: np.ndarray) -> np.ndarray:
-        return np.append(values[:3] + step[:3], values[3] + (step[3] if self.radius_unknown else 0.0))
+        """Return the values after a step (count,)."""
+        return values + np.pad(step, (0, 4 - self.count))
 
     def distances(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return signed distances (N,) of points (N, 3)."""
         return np.linalg.norm(points - values[:3], axis=1) - values[3]
 
     def normals(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
-        away = points - values[:3]
-        return away / np.linalg.norm(away, axis=1, keepdims=True)
+        """Return derivatives (N, 3) of the distances by the points."""
+        return unit_vectors(points - values[:3])
 
     def derivatives(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
-        by_radius = np.full((len(points), int(self.radius_unknown)), -1.0)
-        return np.hstack([-self.normals(values, points), by_radius])
+        """Return derivatives (N, count) of the distances by the parameters."""
+        return np.hstack([-self.normals(values, points), np.full((len(points), self.count - 3), -1.0)])
 
     def to_stored(self, values: np.ndarray, radius_std_mm: float | None) -> SphereFound:
+        """Return the stored form of the artefact."""
         x, y, z, radius = values.tolist()
         return SphereFound(centre_mm=(x, y, z), radius_mm=radius, radius_std_mm=radius_std_mm)
 
 
-class PlaneShape(Shape):
-    """Values: normal and distance (4,). Parameters: two rotations of the normal, and the distance."""
+class PlaneShape:
+    """Plane, like `SphereShape`. Values: normal and distance (4,). Parameters: two rotations, and the distance."""
 
-    kind, fewest_poses = "plane", 8
+    kind: ClassVar[Artefact] = "plane"
+    fewest_poses, flat, count, radius_mm = 8, True, 3, None
 
     def find(self, points: np.ndarray, rng: np.random.Generator) -> Detection | None:
         return find_line(points, rng)
@@ -121,7 +90,7 @@ class PlaneShape(Shape):
         return PlaneFound(normal=(x, y, z), distance_mm=distance)
 
 
-SHAPES: dict[Artefact, type[Shape]] = {each.kind: each for each in (SphereShape, PlaneShape)}
+Shape = SphereShape | PlaneShape
 
 
 Motion = Callable[[float], tuple[np.ndarray, np.ndarray]]
@@ -139,7 +108,7 @@ _LEAST_SHARE = 1e-3  # least factor on the noise of a plane's points, reached at
 
 @dataclass(frozen=True, eq=False)
 class MountState:
-    """Values of all unknowns: mount, artefact (see its `Shape`), scale and time offset."""
+    """Values of all unknowns: mount, artefact (see its shape), scale and time offset."""
 
     rotation: np.ndarray
     translation: np.ndarray
@@ -195,10 +164,6 @@ class Problem(GroupedEvidence[MountState]):
     @property
     def values(self) -> int:
         return 6 + self.shape.count + self.scale + self.time
-
-    @property
-    def groups(self) -> int:
-        return len(self.points)
 
     def rms_mm(self, state: MountState) -> np.ndarray:
         """Return the root mean square distance (P,) of the points of each pose."""
@@ -328,14 +293,10 @@ class Problem(GroupedEvidence[MountState]):
     @cached_property
     def _bins(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """First point (B,) of each bin, its number of points, its pose, and its number in the profile."""
-        starts, poses, places = [], [], []
-        for pose, (count, end) in enumerate(zip(self.counts.tolist(), np.cumsum(self.counts).tolist(), strict=True)):
-            bins = min(_BINS, count)
-            starts.append(end - count + np.linspace(0, count, bins, endpoint=False).astype(int))
-            poses.append(np.full(bins, pose))
-            places.append(np.arange(bins))
-        first = np.concatenate(starts)
-        return first, np.diff(first, append=len(self._all)), np.concatenate(poses), np.concatenate(places)
+        bins = np.minimum(_BINS, self.counts)
+        poses, places = np.repeat(np.arange(len(bins)), bins), np.concatenate([np.arange(count) for count in bins])
+        first = (np.cumsum(self.counts) - self.counts)[poses] + (places * (self.counts / bins)[poses]).astype(int)
+        return first, np.diff(first, append=len(self._all)), poses, places
 
     def bin_means(self, values: np.ndarray) -> np.ndarray:
         """Return means (P, K, ...) of values (N, ...) in bins along the profiles, padded with 0."""
@@ -460,11 +421,6 @@ def to_sheet(points: Sequence[np.ndarray], sheet: np.ndarray) -> list[np.ndarray
 def from_sheet(flat: np.ndarray) -> np.ndarray:
     """Return points or directions (n, 3) in the frame of the sheet from their x and z (n, 2)."""
     return np.column_stack([flat[:, 0], np.zeros(len(flat)), flat[:, 1]])
-
-
-def point_by_mount(point: np.ndarray) -> np.ndarray:
-    """Return derivatives (3, 6) of a point (3,) along the platform's axes by shift and rotation of the mount."""
-    return np.hstack([np.eye(3), np.cross(point, np.eye(3))])
 
 
 def _left_jacobian(vector: np.ndarray) -> np.ndarray:

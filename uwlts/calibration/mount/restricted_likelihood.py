@@ -55,11 +55,6 @@ class GroupedEvidence(ABC, Generic[State]):
         """Number of parameters."""
         return self.free.shape[1]
 
-    @property
-    @abstractmethod
-    def groups(self) -> int:
-        """Number of groups."""
-
     @abstractmethod
     def select(self, kept: np.ndarray) -> Self:
         """Return the evidence of some groups, given as a mask or as their numbers."""
@@ -113,13 +108,14 @@ class RestrictedEstimate(Generic[State]):
         return self.evidence.jacobian(self.state)
 
     @cached_property
-    def _covariances(self) -> tuple[np.ndarray, np.ndarray]:
+    def covariances(self) -> tuple[np.ndarray, np.ndarray]:
+        """Covariances of the residuals (G, K, K) and their derivatives (Q, G, K, K) by the components."""
         return self.evidence.covariance(self.state)(np.log(self.scatter))
 
     @cached_property
     def _weighted(self) -> np.ndarray:
         """Inverse covariance times derivatives (G, K, size)."""
-        return np.linalg.solve(self._covariances[0], self.jacobian)
+        return np.linalg.solve(self.covariances[0], self.jacobian)
 
     @cached_property
     def information(self) -> np.ndarray:
@@ -155,7 +151,7 @@ class RestrictedEstimate(Generic[State]):
         freedom = max(sum(basis.shape[1] for basis in bases) - self.evidence.size, 1)
         for g, (basis, (step, covariance)) in enumerate(zip(bases, self.without_each, strict=True)):
             by = basis.T @ self.jacobian[g]
-            spread = by @ covariance @ by.T + basis.T @ self._covariances[0][g] @ basis
+            spread = by @ covariance @ by.T + basis.T @ self.covariances[0][g] @ basis
             off = basis.T @ self.residuals[g] + by @ step
             limit = len(off) * f.isf(probability, len(off), freedom)
             excess.append(float(off @ np.linalg.solve(spread, off) / limit))
@@ -168,21 +164,12 @@ class RestrictedEstimate(Generic[State]):
         of that variance (Giesbrecht and Burns, Biometrics 41, 1985). ``scales`` (R,) are the fractions of the variances
         that are estimated; the rest is known. The median over the rows is used.
         """
-        _, changes = self._covariances
-        inverses = np.linalg.inv(self._covariances[0])
-        flows = [np.swapaxes(self._weighted, 1, 2) @ change @ self._weighted for change in changes]
-        summed = self.covariance @ np.sum(flows, axis=1)
-        left = [inverses @ change for change in changes]
-        size = len(changes)
-        known = np.zeros((size, size))
-        for a in range(size):
-            for b in range(size):
-                twice = np.einsum("gkp,gkl,glm->pm", self.jacobian, left[a] @ left[b], self._weighted)
-                known[a, b] = 0.5 * (
-                    np.sum(left[a] * np.swapaxes(left[b], 1, 2))
-                    - 2 * np.sum(self.covariance * twice.T)
-                    + np.sum(summed[a] * summed[b].T)
-                )
+        covariances, changes = self.covariances
+        summed = self.covariance @ (np.swapaxes(self._weighted, 1, 2) @ changes @ self._weighted).sum(axis=1)
+        left = np.linalg.inv(covariances) @ changes
+        twice = np.einsum("gkp,agkl,bglm,gmq->abpq", self.jacobian, left, left, self._weighted, optimize=True)
+        known = 0.5 * (np.einsum("agkl,bglk->ab", left, left) + np.einsum("apq,bqp->ab", summed, summed))
+        known -= np.einsum("pq,abqp->ab", self.covariance, twice)
         known[0, 0] += 2 * self.evidence.pool_repeats(self.state)[0]
         free = np.diag(known) > 0
         variances = np.einsum("rp,pq,rq->r", rows, self.covariance, rows)
@@ -220,7 +207,7 @@ def settle_agreeing(
     The worst group is rejected as long as it contradicts the prediction of the others. ``require`` raises an error if a
     mask (G,) leaves too few groups.
     """
-    kept = np.ones(evidence.groups, dtype=bool)
+    kept = np.ones(len(evidence.residuals(starts[0][0])), dtype=bool)
     while True:
         require(kept)
         found = settle(evidence.select(kept), starts)
@@ -244,10 +231,8 @@ def _iterate(evidence: GroupedEvidence[State], state: State, scatter: np.ndarray
     fraction, before, size, criterion = 1.0, np.zeros(evidence.size), 0.0, np.inf
     sizes: list[float] = []
     for _ in range(_MOST_ROUNDS):
-        covariances, _ = evidence.covariance(state)(np.log(scatter))
-        step = solve_step(evidence, state, covariances)
-        by = evidence.jacobian(state)
-        information = np.einsum("gkp,gkq->pq", by, np.linalg.solve(covariances, by))
+        here = RestrictedEstimate(evidence, state, scatter)
+        step, information = solve_step(evidence, state, here.covariances[0]), here.information.sum(axis=0)
         size, last = (float(np.sqrt(each @ information @ each / evidence.size)) for each in (step, before))
         if step @ information @ before >= 0:
             fraction = min(2 * fraction, 1.0)

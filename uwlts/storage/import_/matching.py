@@ -25,8 +25,6 @@ POSE_COLUMNS = tuple(f"pose_{row}{column}" for row in range(4) for column in ran
 _NUMBERS = ("stage_mm", "exposure_ms", "time_s", "encoder")
 _COLUMNS = ("file", "light", "background", *_NUMBERS, *POSE_COLUMNS)
 _MOST_TABLE_BYTES = 8 * 2**20  # a hundred thousand images
-_LONGEST_LINE = 10_000
-"""Longest line in characters; 23 columns take a few hundred."""
 _LIGHTS = ("laser", "lamp", "both", "ignore")
 
 
@@ -64,21 +62,20 @@ def read_rows(path: Path) -> list[ImageRow]:
     """
     text = read_text(path, most_bytes=_MOST_TABLE_BYTES, error=DescriptionError, called="table")
     lines = text.splitlines()
-    if max(map(len, lines), default=0) > _LONGEST_LINE:
-        raise DescriptionError(f"{path} has a line of more than {_LONGEST_LINE:,} characters; expected a CSV table")
     if len(lines) < 2:
         raise DescriptionError(f"{path} is empty: expected a line of column names and one for each image")
     reader = csv.DictReader(lines, delimiter=";" if ";" in lines[0] else ",", skipinitialspace=True)
-    reader.fieldnames = columns = [name.strip() for name in reader.fieldnames or ()]
+    try:
+        reader.fieldnames = columns = [name.strip() for name in reader.fieldnames or ()]
+        found = [(reader.line_num, cells) for cells in reader]
+    except csv.Error as error:
+        raise DescriptionError(f"{path} is no CSV table: {error}") from error
     if not {"file"} <= set(columns) <= set(_COLUMNS) or len(set(columns)) < len(columns):
         raise DescriptionError(
             f"{path} has the columns {', '.join(columns)}; expected file and any of "
             f"{', '.join(_COLUMNS[1:7])}, pose_00 to pose_33, each once"
         )
-    try:
-        rows = [_row(number, cells, f"{path}, line {reader.line_num}") for number, cells in enumerate(reader)]
-    except csv.Error as error:
-        raise DescriptionError(f"{path} is no CSV table: {error}") from error
+    rows = [_row(number, cells, f"{path}, line {line}") for number, (line, cells) in enumerate(found)]
     twice = sorted(name for name, count in Counter(row.file for row in rows).items() if count > 1)
     _refuse_any(twice, f"{path} names ", " more than once: one line for each image")
     return rows

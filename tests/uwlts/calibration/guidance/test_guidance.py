@@ -66,6 +66,7 @@ PLATE = CircleTarget(
 BOARD = ChessboardTarget(columns=11, rows=8, square_mm=12.0)
 NOISE_PX = 0.05
 NO_STRIPE = np.empty((0, 2))
+LIMITS = CompletionLimits()
 
 
 @pytest.fixture(scope="module")
@@ -88,8 +89,9 @@ def seen(setting: Setting, pose: np.ndarray, rng: np.random.Generator) -> Target
     return TargetView(pixels[here] + rng.normal(0, NOISE_PX, (here.sum(), 2)), points[here], indices[here], {})
 
 
-def recorded(setting: Setting, poses, rng: np.random.Generator) -> list[RecordedPose]:
-    return [RecordedPose(seen(setting, pose, rng), NO_STRIPE, float(k)) for k, pose in enumerate(poses)]
+def state_of(setting: Setting, poses, rng: np.random.Generator, wanted: CompletionLimits = LIMITS) -> State:
+    recorded = [RecordedPose(seen(setting, pose, rng), NO_STRIPE, float(k)) for k, pose in enumerate(poses)]
+    return solve_state(recorded, setting, wanted)
 
 
 # Judging images
@@ -222,7 +224,7 @@ def led(setting: Setting, wanted: CompletionLimits, rng: np.random.Generator, *,
         pose[:3, :3] = cv2.Rodrigues(rng.normal(0, 0.05, 3))[0] @ pose[:3, :3]
         pose[:3, 3] += rng.normal(0, 5.0, 3)
         poses.append(pose)
-        state = solve_state(recorded(setting, poses, np.random.default_rng(7)), setting, wanted)
+        state = state_of(setting, poses, np.random.default_rng(7), wanted)
     return state
 
 
@@ -261,13 +263,13 @@ def test_advised_poses_beat_as_many_random_ones(setting):
     wanted = CompletionLimits(focal_std_px=1e-6, centre_std_px=1e-6)
     count = 6
     wished = led(setting, wanted, np.random.default_rng(3), most=count)
-    options = candidates(solve_state([], setting, CompletionLimits()))
+    options = [*candidates(solve_state([], setting, LIMITS))]
     assert len(options) > 20
     stds = []
     for draw in range(12):
         rng = np.random.default_rng(draw)
         chosen = [options[k].pose for k in rng.choice(len(options), count, replace=False)]
-        stds.append(solve_state(recorded(setting, chosen, rng), setting, wanted).std()[LensParameter.F])
+        stds.append(state_of(setting, chosen, rng, wanted).std()[LensParameter.F])
     # Better than the typical draw, and than nearly every one.
     assert wished.std()[LensParameter.F] < 0.8 * np.median(stds)
     assert np.mean(np.array(stds) > wished.std()[LensParameter.F]) >= 10 / 12
@@ -283,7 +285,7 @@ def test_what_is_expected_of_an_image_comes_true(setting):
 
 
 def test_an_image_seen_again_gains_little(setting):
-    state = led(setting, CompletionLimits(), np.random.default_rng(3), most=1)
+    state = led(setting, LIMITS, np.random.default_rng(3), most=1)
     wish = best_pose(state)
     again = seen(setting, state.poses[-1], np.random.default_rng(1))
     other = seen(setting, wish.candidate.pose, np.random.default_rng(1))
@@ -293,8 +295,8 @@ def test_an_image_seen_again_gains_little(setting):
 
 
 def test_poses_that_are_skipped_give_way_to_the_next_best(setting):
-    state = led(setting, CompletionLimits(), np.random.default_rng(3), most=1)
-    count = len(candidates(state))
+    state = led(setting, LIMITS, np.random.default_rng(3), most=1)
+    count = len([*candidates(state)])
     first, second, last, again = (best_pose(state, skipped=skipped) for skipped in (0, 1, count - 1, count))
     assert first.gain >= second.gain >= last.gain and first.gain > last.gain
     assert len({wish.candidate.pose.tobytes() for wish in (first, second, last)}) == 3
@@ -304,7 +306,7 @@ def test_poses_that_are_skipped_give_way_to_the_next_best(setting):
 
 def test_pose_advice_is_in_plain_words(setting):
     near = target_pose(middle_mm=(-60, -40, 330.0))
-    state = solve_state(recorded(setting, [near], np.random.default_rng(0)), setting, CompletionLimits())
+    state = state_of(setting, [near], np.random.default_rng(0))
     far = target_pose(tilt_deg=(25, 0))
     far[:3, 3] = np.array([60.0, 50.0, 450.0]) - far[:3, :3] @ BOARD.points_mm.mean(axis=0)
     words = format_pose_advice(far, state, near)
@@ -317,40 +319,31 @@ def test_pose_advice_is_in_plain_words(setting):
 
 
 def test_what_is_missing_is_said(setting):
-    assert any(
-        "0 images, at least 8" in line for line in describe_missing(solve_state([], setting, CompletionLimits()))
-    )
+    assert any("0 images, at least 8" in line for line in describe_missing(solve_state([], setting, LIMITS)))
     square = [target_pose(middle_mm=(x, 0.0, z)) for x, z in ((-20, 300), (0, 330), (20, 360))]
-    said = " ".join(
-        describe_missing(solve_state(recorded(setting, square, np.random.default_rng(0)), setting, CompletionLimits()))
-    )
+    said = " ".join(describe_missing(state_of(setting, square, np.random.default_rng(0))))
     assert "3 images, at least 8" in said and "% of the image is covered" in said
     assert "never tilted away by 12 deg: the target's right side, left side, lower side, upper side" in said
 
 
 def test_a_sheet_without_stripes_is_missing(setting):
-    state = led(setting, CompletionLimits(), np.random.default_rng(3), most=5)
+    state = led(setting, LIMITS, np.random.default_rng(3), most=5)
     assert state.solution is not None
     assert "the laser line is on the target in 0 of 5 images" in describe_missing_sheet(state)[0]
 
 
 def test_an_image_that_contradicts_the_others_is_refused_with_its_residual(setting):
-    state = led(setting, CompletionLimits(), np.random.default_rng(3), most=6)
+    state = led(setting, LIMITS, np.random.default_rng(3), most=6)
     rng = np.random.default_rng(2)
     wish = best_pose(state)
     right = RecordedPose(seen(setting, wish.candidate.pose, rng), NO_STRIPE, 9.0)
-    assert (
-        judge_residual(state.solution, solve_state([*state.recorded, right], setting, CompletionLimits()).solution)
-        == ()
-    )
+    assert not judge_residual(state.solution, solve_state([*state.recorded, right], setting, LIMITS).solution)
     # A plate that is bent by 1 mm over its width.
     points = BOARD.points_mm
     bent = points - np.column_stack([np.zeros((len(points), 2)), ((points[:, 0] - 60) / 60) ** 2])
     pixels = lens_of(setting.sensor).pixels(bent @ wish.candidate.pose[:3, :3].T + wish.candidate.pose[:3, 3])
     wrong = RecordedPose(replace(right.view, pixels=pixels), NO_STRIPE, 9.0)
-    reasons = judge_residual(
-        state.solution, solve_state([*state.recorded, wrong], setting, CompletionLimits()).solution
-    )
+    reasons = judge_residual(state.solution, solve_state([*state.recorded, wrong], setting, LIMITS).solution)
     assert reasons and reasons[0].startswith("contradicts the others: with it the residual is ")
 
 

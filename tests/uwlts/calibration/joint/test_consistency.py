@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.uwlts.calibration_views import built_sensor
-from tests.uwlts.joint_views import Noise, gathered, target_series
+from tests.uwlts.joint_views import Noise, edited, gathered, target_series
 from tests.virtual_sensors import altered
 from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.camera.lens import LensChoice
@@ -40,12 +40,6 @@ def views():
 
 def named(series, name):
     return replace(series, found=replace(series.found, captures=[name]))
-
-
-def edited(series, edit):
-    """Return the series with each image replaced by ``edit(number, image)``."""
-    images = [edit(number, image) for number, image in enumerate(series.found.images)]
-    return replace(series, found=replace(series.found, images=images))
 
 
 def stripes_edited(series, edit):

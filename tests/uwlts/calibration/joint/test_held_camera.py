@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.uwlts.calibration_views import built_sensor
-from tests.uwlts.joint_views import Noise, gathered, target_series
+from tests.uwlts.joint_views import Noise, edited, gathered, target_series
 from tests.virtual_sensors import altered
 from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.camera.lens import LensChoice
@@ -38,10 +38,9 @@ def drawn(seed, kind):
     tilts = TILTS if kind == "by hand" else None
     positions = np.linspace(-120, 60, len(TILTS))
     series = target_series(real, positions=positions, noise=noise, columns=7, tilts=tilts, **wet)
-    stripes = [pixels[::4] for pixels in series.found.stripes]
     poses = "free" if kind == "by hand" else "stage"
     options = CalibrationOptions(poses=poses, correct_circles=False, lens=LensChoice())
-    return real, described, replace(series, found=replace(series.found, stripes=stripes)), options
+    return real, described, edited(series, every=4), options
 
 
 @pytest.mark.parametrize("kind", ["water", "air", "by hand"])

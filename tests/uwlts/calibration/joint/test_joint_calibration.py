@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from tests.uwlts.calibration_views import WATER, built_sensor
-from tests.uwlts.joint_views import Noise, assert_derivatives, gathered, lit_points, step_views, target_series
+from tests.uwlts.joint_views import Noise, assert_derivatives, edited, gathered, lit_points, step_views, target_series
+from tests.uwlts.scan_views import square_sensor
 from tests.uwlts.simulated_campaign import ModelErrors, drawn_reality, evidence
 from tests.virtual_sensors import altered
 from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.joint.initial import estimate_series_start
-from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior, ViewMedium
+from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior, ViewMedium, window_values
 from uwlts.calibration.joint.residuals import TARGET, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError
@@ -101,19 +102,10 @@ def test_the_sheet_is_where_fermat_sees_the_fan(medium_index, tilt_deg, bow):
 def at_truth(view):
     """Parameters and a vector at what the views were made with, and the start for the series of a view."""
     nominal = nominal_calibration(BUILT)
-    pose = laser_pose(BUILT)
-    middle = camera_from_object(BUILT)[:3, 3]
-    sheet = DescribedSheet(pose.normal, pose.axis, middle, pose.origin_mm, pose.origin_mm + 36.0 * pose.axis)
     series = target_series(BUILT, medium=view.medium, window=view.window, positions=IN_WATER[:4])
     window = nominal.window
     start = estimate_series_start([series], BUILT, window, [WATER], options=OPTIONS)
-    normal = np.array(window.normal) / window.normal[2]
-    known = {
-        "window_distance": window.distance_mm,
-        "window_slope_x": normal[0],
-        "window_slope_y": normal[1],
-        "glass_thickness": window.thickness_mm,
-        "glass_index": window.glass_index,
+    known = {key.text: value for key, value in window_values(window).items()} | {
         "index of water": WATER,
         "sheet_turn_fan": 0.001,
         "sheet_turn_axis": -0.002,
@@ -130,7 +122,7 @@ def at_truth(view):
         "height of the 23 mm step": 23.0,
     }
     priors = {parse_parameter(text): Prior(value, 1.0) for text, value in known.items()}
-    parameters = Parameters(start.intrinsics, sheet, window, ("water",), priors)
+    parameters = Parameters(start.intrinsics, DescribedSheet.from_sensor(BUILT), window, ("water",), priors)
     return parameters, parameters.start(start.intrinsics.from_model(nominal.camera)), start
 
 
@@ -261,8 +253,7 @@ def test_free_poses_are_refused_where_the_stage_moves_as_in_a_mirror(noise, thes
 
 def test_steps_add_the_window_to_a_target_in_air(thesis):
     """The laser's window is square to the sheet here, as the step views need it."""
-    laser = BUILT.laser.model_copy(update={"window": BUILT.laser.window.model_copy(update={"tilt_y_deg": 0.0})})
-    sensor = BUILT.model_copy(update={"laser": laser})
+    sensor = square_sensor()
     noise = Noise(circles_px=0.03, stripe_px=0.1, rng=np.random.default_rng(2))
     air = target_series(sensor, window=False, positions=AIR, noise=noise)
     result = solve_jointly(gathered(thesis, [air], step_views(sensor, noise=noise)), options=OPTIONS)
@@ -277,13 +268,11 @@ def test_steps_add_the_window_to_a_target_in_air(thesis):
 def test_outliers_do_not_count(in_water, thesis):
     clean = solve_jointly(gathered(thesis, [in_water]), options=OPTIONS)
     rng = np.random.default_rng(1)
-    images = []
-    for image in in_water.found.images:
-        pixels = image.pixels.copy()
-        pixels[rng.random(len(pixels)) < 0.02] += 3.0
-        images.append(replace(image, pixels=pixels))
-    spoilt = replace(in_water, found=replace(in_water.found, images=images))
-    result = solve_jointly(gathered(thesis, [spoilt]), options=OPTIONS)
+
+    def spoilt(_, image):
+        return replace(image, pixels=image.pixels + 3.0 * (rng.random((len(image.pixels), 1)) < 0.02))
+
+    result = solve_jointly(gathered(thesis, [edited(in_water, spoilt)]), options=OPTIONS)
     moved = np.abs(result.estimate.values - clean.estimate.values) / np.sqrt(np.diag(clean.estimate.covariance))
     assert result.estimate.outliers >= 50
     assert moved.max() < 1.0
@@ -293,13 +282,12 @@ def test_images_that_no_camera_explains_are_refused_and_the_worst_named(thesis):
     """Points in waves of 4 px, in one image of 6; a thousandth of the focal length, 2.4 px, is allowed."""
     air = target_series(BUILT, window=False, positions=AIR[::2], columns=13)
 
-    def off(number, image):
-        return (6.0 if number == 3 else 4.0) * np.sin(image.pixels[:, ::-1] / 30.0)
+    def waved(number, image):
+        off = (6.0 if number == 3 else 4.0) * np.sin(image.pixels[:, ::-1] / 30.0)
+        return replace(image, pixels=image.pixels + off)
 
-    images = [replace(each, pixels=each.pixels + off(number, each)) for number, each in enumerate(air.found.images)]
-    spoilt = replace(air, found=replace(air.found, images=images))
     with pytest.raises(CalibrationError, match="no camera fits the target images in air: .* in target, frame 3: "):
-        solve_jointly(gathered(thesis, [spoilt]), options=OPTIONS)
+        solve_jointly(gathered(thesis, [edited(air, waved)]), options=OPTIONS)
 
 
 def test_a_target_without_stripes_is_refused(in_water, thesis):

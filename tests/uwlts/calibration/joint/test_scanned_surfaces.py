@@ -17,7 +17,7 @@ from uwlts.calibration.joint import policy
 from uwlts.calibration.joint.estimate import estimate
 from uwlts.calibration.joint.gathering import scan_stripes
 from uwlts.calibration.joint.initial import build_all_scan_evidence, build_scan_evidence
-from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior
+from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior, window_values
 from uwlts.calibration.joint.residuals import STEP, Residuals
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, ScannedPipe, ScannedPlane, ScannedSpheres
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
@@ -25,7 +25,7 @@ from uwlts.errors import CalibrationError, CaptureError, DescriptionError
 from uwlts.fitting.schur_least_squares import LocalPrior
 from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard
 from uwlts.model.parameter_keys import parse_parameter
-from uwlts.model.placement import camera_from_object, laser_pose
+from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Medium
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.triangulation import reconstruct_profile
@@ -52,32 +52,15 @@ SIZE_FOUND = re.compile(r"found ([\d.]+), described as .* \(([-+.\d]+) mm or ([\
 
 def parameters(**std):
     """Return parameters as built and known, except those with a standard uncertainty in ``std``."""
-    nominal, pose = nominal_calibration(SENSOR), laser_pose(SENSOR)
-    window = nominal.window
-    normal = np.array(window.normal) / window.normal[2]
-    sheet = DescribedSheet(
-        pose.normal, pose.axis, camera_from_object(SENSOR)[:3, 3], pose.origin_mm, pose.origin_mm + 36.0 * pose.axis
-    )
-    known = {
-        "window_distance": window.distance_mm,
-        "window_slope_x": normal[0],
-        "window_slope_y": normal[1],
-        "glass_thickness": window.thickness_mm,
-        "glass_index": window.glass_index,
-        "index of water": WATER,
-        "sheet_turn_fan": 0.0,
-        "sheet_turn_axis": 0.0,
-        "sheet_offset": 0.0,
-        "stage_scale": 0.0,
-        "scan_slope_1": 0.0,
-        "scan_slope_2": 0.0,
-    }
+    nominal = nominal_calibration(SENSOR)
+    known = {key.text: value for key, value in window_values(nominal.window).items()} | {"index of water": WATER}
+    known |= dict.fromkeys(("sheet_turn_fan", "sheet_turn_axis", "sheet_offset", "stage_scale", *SLOPE_NAMES), 0.0)
     priors = {
         parse_parameter(text): Prior(value, std.get(text.replace(" ", "_"), 1e-9)) for text, value in known.items()
     }
     camera = SENSOR.camera
     intrinsics = Intrinsics(CameraOptions(), width_px=camera.width_px, height_px=camera.height_px)
-    found = Parameters(intrinsics, sheet, window, ("water",), priors)
+    found = Parameters(intrinsics, DescribedSheet.from_sensor(SENSOR), nominal.window, ("water",), priors)
     return found, found.start(intrinsics.from_model(nominal.camera))
 
 
@@ -149,7 +132,7 @@ def test_known_sizes_are_off_by_their_standard_uncertainties():
     """Diameters of unknown uncertainty do not count, nor does anything of the same spheres of unknown size."""
     evidence, _ = evidence_of("spheres", artefact=STANDARD.model_copy(update={"spacing_uncertainty_mm": 0.02}))
     surface = evidence.surface
-    local = true_own("spheres", evidence)[: surface.parameter_count()]
+    local = true_own("spheres", evidence)[: surface.parameter_count]
     assert surface.sizes(local).residuals()[0] == pytest.approx([0.0], abs=1e-9)
     local[3:6] += 0.03 * (local[3:6] - local[:3]) / SPACING
     local[7] += 0.5
@@ -406,8 +389,9 @@ def test_images_of_a_scan_are_left_out_as_long_as_enough_agree(thesis, target_in
     seen = replace(gathered(thesis, [target_in_water]), scans=[scanned("spheres")])
     assert seen.remove_images({"spheres.h5, at 0 mm"}).scans[0].image_names() == seen.scans[0].image_names()
     (kept,) = seen.remove_images({"spheres.h5, at 0 mm", "spheres.h5, at -18 mm"}).scans
-    assert np.unique(kept.frame).tolist() == sorted({*seen.scans[0].frame.tolist()} - {0, 6})
-    assert len(kept.line) == len(kept.slopes) == np.isin(seen.scans[0].frame, kept.frame).sum()
+    every, frames = seen.scans[0].found.frame, kept.found.frame
+    assert np.unique(frames).tolist() == sorted({*every.tolist()} - {0, 6})
+    assert len(kept.found.line) == len(kept.slopes) == np.isin(every, frames).sum()
     assert seen.remove_images({f"spheres.h5, at {position:g} mm" for position in STAGE[:4]}) is None
 
 
@@ -415,9 +399,7 @@ def test_scans_that_do_not_show_what_they_say_are_left_out():
     bodies, plane = KINDS["plane"]
     stripes, _ = scan_of(SENSOR, bodies, plane, stage_mm=STAGE[:3], count=300)
     wrong = replace(stripes, artefact=PipeStandard(diameter_mm=220.0), source="pipe.h5")
-    few = replace(
-        stripes, **{name: getattr(stripes, name)[::4] for name in ("frame", "line", "centre_px", "width_px", "slopes")}
-    )
+    few = replace(stripes, found=stripes.found[::4], slopes=stripes.slopes[::4])
     found, warnings = build_all_scan_evidence(
         [wrong, few, stripes], nominal_calibration(SENSOR), SENSOR, [WATER], sizes_known=True
     )
@@ -472,10 +454,11 @@ def test_what_blur_and_the_sheets_thickness_leave_is_common_to_all_points():
     square = Body((0.0, 0.0, 40.0), None, (0.0, 0.0, 1.0))
     stripes, _ = scan_of(SENSOR, (square,), PlaneStandard(), stage_mm=STAGE, count=300)
     nominal, rng = nominal_calibration(SENSOR), np.random.default_rng(4)
-    blur, slopes = rng.normal(0, 0.05, len(stripes.line)), rng.normal(0, 0.05, len(stripes.line))
+    seen = stripes.found
+    blur, slopes = rng.normal(0, 0.05, (2, len(seen.line)))
     given = {"medium_index": WATER, "sizes_known": True, "image": 0}
     plain, _ = build_scan_evidence(replace(stripes, blur_px=blur, slopes=0 * slopes), nominal, SENSOR, **given)
-    kept = np.searchsorted(stripes.frame * 1e6 + stripes.line, plain.frame * 1e6 + plain.pixels[:, 0])
+    kept = np.searchsorted(seen.frame * 1e6 + seen.line, plain.frame * 1e6 + plain.pixels[:, 0])
     np.testing.assert_allclose(plain.common_px, np.abs(blur[kept]) / np.sqrt(3), rtol=1e-9)
     common = {}
     for thickness in (0.1, 0.3):
@@ -485,11 +468,11 @@ def test_what_blur_and_the_sheets_thickness_leave_is_common_to_all_points():
         common[thickness] = found.common_px
     np.testing.assert_allclose(common[0.3], 3 * common[0.1], rtol=1e-9)
     moved_z = np.abs(nominal.object_transform()[:3, 2] @ found.beside_mm)
-    below = replace(stripes, centre_px=stripes.centre_px + 1.0)
+    below = replace(seen, centre_px=seen.centre_px + 1.0)
     z = [
         reconstruct_profile(
             nominal, each.line, each.centre_px, medium_index=WATER, stage_mm=0.0, stage_direction=np.array([1.0, 0, 0])
         ).points_mm[:, 2]
-        for each in (stripes, below)
+        for each in (seen, below)
     ]
     np.testing.assert_allclose(common[0.1], 0.2 * moved_z / np.abs(z[1] - z[0])[kept], rtol=0.02)

@@ -9,13 +9,7 @@ import pytest
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import target_series
 from uwlts.calibration.camera.camera_parameters import CameraOptions, Intrinsics
-from uwlts.calibration.joint.diagnose import (
-    Findings,
-    check_consistency,
-    deviations,
-    estimate_birge_ratio,
-    format_deviation,
-)
+from uwlts.calibration.joint.diagnose import Findings, PriorDeviations, check_consistency, deviations, format_deviation
 from uwlts.calibration.joint.estimate import UNSETTLED, Estimate, Noise
 from uwlts.calibration.joint.initial import estimate_series_start
 from uwlts.calibration.joint.parameters import DescribedSheet, EarlierEstimate, Parameters, Prior, ViewMedium
@@ -169,7 +163,7 @@ def test_descriptions_that_are_all_too_sure_are_noticed(count, off, factor):
     """Six squares exceed 22.5 once in a thousand times: 13.5 do not, 37.5 do."""
     keys = [*WindowParameter, SheetParameter.BOW][:count]
     known = {key: ((0.0, 1.0), ((-1) ** n * off, 1e-3)) for n, key in enumerate(keys)}
-    assert estimate_birge_ratio(estimate_of(known)[0]) == pytest.approx(factor, rel=1e-3)
+    assert PriorDeviations(deviations(estimate_of(known)[0], least=0.0)).birge_ratio == pytest.approx(factor, rel=1e-3)
 
 
 @pytest.mark.parametrize(("share", "wrong"), [(0.07, None), (0.09, False), (-0.09, False), (-0.21, True), (0.21, True)])

@@ -45,23 +45,26 @@ def views(count, rng):
         yield seen
 
 
+def image_of(in_camera, platform, rng):
+    """Image with an error of the target's pose from its covariance."""
+    std = np.array([0.02, 0.02, 0.15, 2e-3, 2e-3, 2e-4])
+    step = std * rng.normal(size=6)
+    found = np.eye(4)
+    found[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ in_camera[:3, :3]
+    found[:3, 3] = in_camera[:3, :3] @ MIDDLE + in_camera[:3, 3] + step[:3] - found[:3, :3] @ MIDDLE
+    return BoardImage("", found, np.diag(std**2), 50, 0.1, platform)
+
+
 def simulated(rng, *, count=12, position_mm=0.05, turn_rad=3e-4, wrong=()):
     """Images with pose errors from their covariance, and a platform with scatter of positions and rotations."""
     images = []
-    std = np.array([0.02, 0.02, 0.15, 2e-3, 2e-3, 2e-4])
     for number, seen in enumerate(views(count, rng)):
-        step = std * rng.normal(size=6)
-        in_camera = CAMERA @ seen
-        turn = Rotation.from_rotvec(step[3:]).as_matrix() @ in_camera[:3, :3]
-        place = in_camera[:3, :3] @ MIDDLE + in_camera[:3, 3] + step[:3]
-        found = np.eye(4)
-        found[:3, :3], found[:3, 3] = turn, place - turn @ MIDDLE
         platform = TARGET @ np.linalg.inv(seen) @ np.linalg.inv(MOUNT)
         platform[:3, 3] += position_mm * rng.normal(size=3)
         platform[:3, :3] = Rotation.from_rotvec(turn_rad * rng.normal(size=3)).as_matrix() @ platform[:3, :3]
         if number in wrong:
             platform[:3, 3] += 4.0
-        images.append(BoardImage(f"image {number}", found, np.diag(std**2), 50, 0.1, platform))
+        images.append(image_of(CAMERA @ seen, platform, rng))
     return images
 
 
@@ -86,25 +89,16 @@ def test_the_covariance_is_that_of_the_errors():
     assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.35
 
 
-def table_images(rng, angles, *, position_mm=0.01, turn_rad=5e-5):
+def table_images(rng, angles_deg):
     """Images of a target on a table that turns it, and the table's frame in the sensor's (4, 4)."""
-    std = np.array([0.02, 0.02, 0.15, 2e-3, 2e-3, 2e-4])
     table, target = pose((130.0, 10.0, 0.0), (5.0, 20.0, 90.0)), pose((20.0, -15.0, 40.0), (30.0, -10.0, 25.0))
-    images = []
-    for number, angle in enumerate(angles):
-        step = std * rng.normal(size=6)
-        in_camera = CAMERA @ table @ pose((0, 0, np.degrees(angle)), (0, 0, 0)) @ target
-        turn = Rotation.from_rotvec(step[3:]).as_matrix() @ in_camera[:3, :3]
-        found = np.eye(4)
-        found[:3, :3], found[:3, 3] = turn, in_camera[:3, :3] @ MIDDLE + in_camera[:3, 3] + step[:3] - turn @ MIDDLE
-        platform = pose((0, 0, -np.degrees(angle)), (0, 0, 0))
-        images.append(BoardImage(f"image {number}", found, np.diag(std**2), 50, 0.1, platform))
-    return images, table
+    turns = [pose((0, 0, angle), (0, 0, 0)) for angle in angles_deg]
+    return [image_of(CAMERA @ table @ turn @ target, np.linalg.inv(turn), rng) for turn in turns], table
 
 
 def test_the_axis_of_a_rotary_table_is_found():
     """Direction and place have two coordinates each; their chi-square with four degrees is below 36 but once in 3e6."""
-    images, table = table_images(np.random.default_rng(2), np.radians(np.linspace(-40, 40, 12)))
+    images, table = table_images(np.random.default_rng(2), np.linspace(-40, 40, 12))
     problem = BoardEvidence(images, CAMERA, MIDDLE, table=True)
     estimate, kept = select_agreeing_images(problem)
     state = estimate.state
@@ -190,18 +184,16 @@ def test_wrong_evidence_is_refused(thesis, capture_path):
     calibration = nominal(thesis, medium="water")
     with Capture(capture_path) as capture:
         poses = capture.pose[:]
-    with pytest.raises(DescriptionError, match="found 6 poses for 7 images"):
-        uwlts.calibrate_mount(capture_path, poses[:6], calibration=calibration)
-    with pytest.raises(CalibrationError, match="T_base_platform"):
-        uwlts.calibrate_mount(capture_path, np.linalg.inv(poses), calibration=calibration)
-    with pytest.raises(CalibrationError, match="insufficient rotation|T_base_platform"):
-        uwlts.calibrate_mount(capture_path, np.tile(poses[0], (7, 1, 1)), calibration=calibration)
-    with pytest.raises(DescriptionError, match="shows a target: give no artefact"):
-        uwlts.calibrate_mount(capture_path, calibration=calibration, radius_mm=3.0)
-    with pytest.raises(DescriptionError, match="shows a target: give no artefact"):
-        uwlts.calibrate_mount(capture_path, calibration=calibration, artefact_kind="plane")
-    with pytest.raises(DescriptionError, match="`pose_unit` describe a file of poses; there is none"):
-        uwlts.calibrate_mount(capture_path, calibration=calibration, pose_unit="m")
+    for wrong, error, says in (
+        ({"poses": poses[:6]}, DescriptionError, "found 6 poses for 7 images"),
+        ({"poses": np.linalg.inv(poses)}, CalibrationError, "T_base_platform"),
+        ({"poses": np.tile(poses[0], (7, 1, 1))}, CalibrationError, "insufficient rotation|T_base_platform"),
+        ({"radius_mm": 3.0}, DescriptionError, "shows a target: give no artefact"),
+        ({"artefact_kind": "plane"}, DescriptionError, "shows a target: give no artefact"),
+        ({"pose_unit": "m"}, DescriptionError, "`pose_unit` describe a file of poses; there is none"),
+    ):
+        with pytest.raises(error, match=says):
+            uwlts.calibrate_mount(capture_path, calibration=calibration, **wrong)
 
 
 def test_a_target_s_pose_follows_the_sensor(thesis, capture_path):

@@ -8,7 +8,7 @@ from scipy.optimize import brentq
 from scipy.stats import f, norm, t
 
 from tests.uwlts.mount_views import MOUNT, RADIUS_MM, SPHERE_MM, sphere_campaign
-from uwlts.calibration.mount.profile_evidence import SHAPES, MountState, Problem
+from uwlts.calibration.mount.profile_evidence import MountState, PlaneShape, Problem, SphereShape
 from uwlts.calibration.mount.restricted_likelihood import NotSettled, settle, settle_agreeing
 
 
@@ -28,7 +28,14 @@ def profiles_of(kind: str) -> tuple[Problem, MountState]:
     def motion(offset_s: float) -> tuple[np.ndarray, np.ndarray]:
         return campaign.poses[:, :3, :3], campaign.poses[:, :3, 3] + offset_s * np.array([3.0, 5.0, -2.0])
 
-    problem = Problem(points, motion, np.array([0.0, 1.0, 0.0]), SHAPES[kind](), scale=True, time=True)
+    problem = Problem(
+        points,
+        motion,
+        np.array([0.0, 1.0, 0.0]),
+        PlaneShape() if kind == "plane" else SphereShape(),
+        scale=True,
+        time=True,
+    )
     return problem, MountState(MOUNT[:3, :3], MOUNT[:3, 3], artefact)
 
 
@@ -122,10 +129,6 @@ class Readings:
     squares: float
 
     size = 1
-
-    @property
-    def groups(self):
-        return len(self.read)
 
     def select(self, kept):
         return replace(self, read=self.read[kept])

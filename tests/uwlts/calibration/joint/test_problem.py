@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.uwlts.calibration_views import built_sensor
-from tests.uwlts.joint_views import Noise, gathered, target_series
+from tests.uwlts.joint_views import Noise, edited, gathered, target_series
 from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.joint.problem import joint_problem
 from uwlts.calibration.joint.residuals import TARGET
@@ -24,12 +24,11 @@ def series(seed=5, *, wider=0.0):
     found = target_series(
         BUILT, window=False, positions=np.linspace(-150.0, 50.0, 8), noise=noise, columns=7, tilts=TILTS
     )
-    images = [
-        replace(image, points_mm=image.points_mm * [1 - wider * (number % 2), 1.0, 1.0])
-        for number, image in enumerate(found.found.images)
-    ]
-    stripes = [pixels[::12] for pixels in found.found.stripes]
-    return replace(found, found=replace(found.found, images=images, stripes=stripes))
+
+    def widened(number, image):
+        return replace(image, points_mm=image.points_mm * [1 - wider * (number % 2), 1.0, 1.0])
+
+    return edited(found, widened, every=12)
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +55,6 @@ def test_an_estimate_without_some_images_is_that_of_a_new_solution(problem, solv
 def test_halves_of_good_evidence_agree_and_their_difference_is_as_large_as_stated(problem, solved):
     halves = problem.linearise(solved).compare_halves()
     assert max(each.sigmas() for each in halves) < 4
-    assert problem.linearise(solved).disagreements() == []
 
 
 def test_held_out_images_are_predicted_to_their_noise(problem, solved):
