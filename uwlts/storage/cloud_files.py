@@ -468,7 +468,7 @@ def _read_hdf5(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
             points = find_dataset(file, "points_mm", path=path)
             total = 0 if points is None or not points.ndim else len(points)
             chosen = rows(total)
-            selection = dict.fromkeys((*KINDS, *_UNCERTAINTY), (chosen,))
+            selection: dict[str, tuple[slice, ...]] = dict.fromkeys((*KINDS, *_UNCERTAINTY), (chosen,))
             selection |= dict.fromkeys(("patterns_mm", "poses_mm"), (slice(None), chosen))
             found = {name: read_array(file, name, path=path, selection=each) for name, each in selection.items()}
     except DAMAGE as error:

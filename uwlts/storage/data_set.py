@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import cv2
 import numpy as np
@@ -134,6 +134,7 @@ def _decode(ending: str, content: bytes) -> Any:
 
 
 Split = Literal["train", "validation", "test"]
+SPLITS: tuple[Split, ...] = get_args(Split)
 CARD = "dataset.json"
 CARD_FORMAT = "uwlts-dataset"
 CARD_VERSION = 2  # of the file format

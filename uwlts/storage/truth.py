@@ -5,6 +5,7 @@ import json
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -91,7 +92,7 @@ def read_truth(path: str | Path) -> tuple[TruthHeader, Truth]:
         with h5py.File(path, "r") as file:
             header = read_label(file, TruthHeader, path=path, file_format=FORMAT, version=VERSION)
             stored = _DIMENSIONS | {name: count for name, count in _LATER.items() if name in file}
-            arrays = {name: read_array(file, name, path=path) for name in stored}
+            arrays: dict[str, Any] = {name: read_array(file, name, path=path) for name in stored}
     except DAMAGE as error:
         raise CaptureError(f"{path} is not a truth file, or is damaged: {error}") from error
     for name, dimensions in stored.items():

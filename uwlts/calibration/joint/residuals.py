@@ -50,7 +50,8 @@ class Residuals:
     def weighted(self, sigma_px: float, used: np.ndarray | slice = slice(None)) -> Observation:
         """Return the ``used`` residuals in standard deviations, with their derivatives."""
         columns = (self.values[:, None], self.by_global, self.by_local)
-        return Observation(*(column[used] / sigma_px for column in columns), self.local_columns)
+        values, by_global, by_local = (column[used] / sigma_px for column in columns)
+        return Observation(values, by_global, by_local, self.local_columns)
 
 
 @dataclass(frozen=True, eq=False)

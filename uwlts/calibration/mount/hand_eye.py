@@ -109,7 +109,7 @@ def mount_by_board(
     covariance, share, factor = mount_covariance(
         estimate, used.free, state[0][:3, :3], known, lambda: used.residual_derivatives(state)
     )
-    weak = weaknesses(covariance[:6, :6], rotations[np.flatnonzero(kept)], table=used.table)
+    weak = weaknesses(covariance[:6, :6], Rotation.from_matrix(rotations.as_matrix()[kept]), table=used.table)
     require_determined(covariance, weak)
     found = {image.name: used.offsets_mm(state)[k] for k, image in enumerate(used.images)}
     others = [used.apply_step(state, step) for step, _ in estimate.without_each]

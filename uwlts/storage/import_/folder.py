@@ -77,7 +77,7 @@ class _Content:
             self._found[f"black {light}"].append(name)
             return
         examined = len(self._found[light]) - len(self._found[f"black {light}"]) <= _MOST_EXAMINED
-        found = {"mosaic": examined and is_mosaic(image)}
+        found: dict[str, object] = {"mosaic": examined and is_mosaic(image)}
         if light == "laser":
             low, middle, high = np.percentile(image, (0.1, 50, 99.9))
             lines = clipped.any(axis=1 if self._stripe_along == "height" else 0)
