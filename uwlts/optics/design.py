@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.errors import DesignError, RangeError
+from uwlts.errors import DesignError
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Camera, Medium, Sensor, Window
 
@@ -38,9 +38,7 @@ _TINY_MM = 1e-9  # offset that avoids an undefined direction for a point on the 
 _EDGE_STEPS = 5  # Newton steps to an edge of the image; converges quadratically from a close start
 _NEAREST_MM = 1.0  # least distance of the sheet's entry into the image from the window's outer face
 FARTHEST_MM = 1e6  # largest distance of the sheet's exit from the image, from the pupil; no water is transparent as far
-CLAMPED, UNCLAMPED = 0.75, 1.125
-"""K_w of thesis Eq. 3.2. Plate theory (Timoshenko) gives 3/4 for a clamped edge and 3 (3 + nu) / 8 for a supported one.
-The value 1.125 assumes Poisson's ratio nu = 0; glass with nu = 0.2 would have 1.2."""
+_CLAMPED = 0.75  # K_w of thesis Eq. 3.2 for a clamped edge, by plate theory (Timoshenko)
 DEPOLARISED_CONTRAST = math.sqrt(0.5)
 """Speckle contrast of a depolarising surface such as paint: the sum of two independent patterns of equal mean (Goodman,
 Speckle Phenomena in Optics, section 3.4)."""
@@ -454,65 +452,36 @@ def scheimpflug_angle_rad(*, triangulation_angle_rad: float, magnification: floa
 
     Behind a flat window the sheet appears at tan theta = n tan theta_t, and k follows from the apparent distance.
     """
-    if not 0 < triangulation_angle_rad < math.pi / 2:
-        raise RangeError(f"the triangulation angle is {triangulation_angle_rad:g} rad; expected 0 to pi / 2")
-    _require_positive(magnification=magnification)
     return math.atan(math.tan(triangulation_angle_rad) / magnification)
 
 
-def speckle_limit_um(
-    *,
-    wavelength_nm: float,
-    focal_length_mm: float,
-    f_number: float,
-    distance_mm: float,
-    contrast: float = DEPOLARISED_CONTRAST,
-) -> float:
+def speckle_limit_um(*, wavelength_nm: float, focal_length_mm: float, f_number: float, distance_mm: float) -> float:
     """Return the standard uncertainty of a laser spot's position on the object because of speckle, in um.
 
-    The uncertainty across the camera's axis is C lambda / (2 pi sin u), with speckle contrast C (Dorsch, Haeusler and
-    Herrmann 1994, Applied Optics 33:1306). From the object, the pupil of diameter f / N appears under the half-angle u.
+    The uncertainty across the camera's axis is C lambda / (2 pi sin u), with the speckle contrast C of
+    `DEPOLARISED_CONTRAST` (Dorsch, Haeusler and Herrmann 1994, Applied Optics 33:1306). From the object, the pupil of
+    diameter f / N appears under the half-angle u.
 
     The uncertainty along the laser's axis is larger by 1 / sin theta_t. The thesis's 16 um at 250 mm is the value
     across the axis for a contrast of 1; its value in depth is 28 um.
 
     Behind a window, ``distance_mm`` is the apparent distance from the pupil.
     """
-    _require_positive(
-        wavelength_nm=wavelength_nm,
-        focal_length_mm=focal_length_mm,
-        f_number=f_number,
-        distance_mm=distance_mm,
-        contrast=contrast,
-    )
     sine = math.sin(math.atan(focal_length_mm / f_number / 2 / distance_mm))
-    return 1e-3 * contrast * wavelength_nm / (2 * math.pi * sine)
+    return 1e-3 * DEPOLARISED_CONTRAST * wavelength_nm / (2 * math.pi * sine)
 
 
-def window_thickness_mm(
-    *, pressure_mpa: Array, unsupported_diameter_mm: Array, strength_mpa: Array, support: float = CLAMPED
-) -> Array:
-    """Return the thickness of a round window, t = A / 2 sqrt(K_w f_s dP / S_f) (Harris 1999, thesis Eq. 3.2).
+def window_thickness_mm(*, pressure_mpa: Array, unsupported_diameter_mm: Array, strength_mpa: Array) -> Array:
+    """Return the thickness of a clamped round window, t = A / 2 sqrt(K_w f_s dP / S_f) (Harris 1999, thesis Eq. 3.2).
 
-    A is ``unsupported_diameter_mm``, dP ``pressure_mpa``, S_f ``strength_mpa``; K_w follows from the edge's
-    ``support``, and the safety factor f_s is 4.
+    A is ``unsupported_diameter_mm``, dP ``pressure_mpa``, S_f ``strength_mpa``, and the safety factor f_s is 4.
 
     The thesis prints 5.53 mm for 1 MPa without A, K_w and S_f. Its Figure 34 lists only fused silica (60 MPa). With
-    f_s = 4, the diameter A is then 49.5 mm if clamped and 40.4 mm if not. The bore of 63 mm would need 7.0 mm if
-    clamped.
+    f_s = 4, the diameter A is then 49.5 mm. The bore of 63 mm would need 7.0 mm.
     """
-    return 0.5 * unsupported_diameter_mm * np.sqrt(support * 4.0 * pressure_mpa / strength_mpa)
+    return 0.5 * unsupported_diameter_mm * np.sqrt(_CLAMPED * 4.0 * pressure_mpa / strength_mpa)
 
 
 def line_needed_mm(*, pipe_diameter_mm: float, passes: int) -> float:
     """Return the line length that covers a pipe's circumference: the inscribed polygon's side (thesis Figure 27)."""
-    _require_positive(pipe_diameter_mm=pipe_diameter_mm)
-    if passes < 2:
-        raise RangeError(f"passes is {passes}; a pipe's whole circumference needs at least 2")
     return pipe_diameter_mm * math.sin(math.pi / passes)
-
-
-def _require_positive(**values: float) -> None:
-    for name, value in values.items():
-        if not 0 < value < math.inf:
-            raise RangeError(f"{name} is {value:g}; expected a positive number")

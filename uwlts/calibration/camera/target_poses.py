@@ -134,7 +134,6 @@ _LARGEST_CENTRE_STD = 0.05
 # wrong.
 _SETTLED_PX = 1e-4
 _BIAS_ROUNDS = 10
-_X, _Y = np.eye(3)[:2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,13 +174,10 @@ class CameraSolution:
         """Return the root mean square distance between detected and calculated pixels over all images."""
         return float(np.sqrt(np.mean(np.sum(np.vstack(self.residuals_px) ** 2, axis=1))))
 
-    def largest_bias_px(self) -> float | None:
-        """Return the largest corrected offset over all circles."""
-        return None if self.bias_px is None else float(np.max(np.linalg.norm(np.vstack(self.bias_px), axis=1)))
-
     def figures(self) -> dict[str, JsonValue]:
         """Return residuals, standard deviations and covariance for files; None for missing values."""
         direction, tilt, tilt_std = self.stage_direction, self.stage_tilt_rad, self.stage_tilt_std_rad
+        bias_px = None if self.bias_px is None else np.linalg.norm(np.vstack(self.bias_px), axis=1)
         return {
             "images": len(self.residuals_px),
             "points": sum(map(len, self.residuals_px)),
@@ -194,7 +190,7 @@ class CameraSolution:
             "stage_direction": None if direction is None else direction.tolist(),
             "stage_tilt_deg": None if tilt is None else float(np.degrees(tilt)),
             "stage_tilt_std_deg": None if tilt_std is None else float(np.degrees(tilt_std)),
-            "largest_circle_bias_px": self.largest_bias_px(),
+            "largest_circle_bias_px": None if bias_px is None else float(bias_px.max()),
             "rounds": self.rounds,
             "stopped": self.stopped,
         }
@@ -303,11 +299,9 @@ def centre_offsets(
 
     Raises RangeError if a circle's image is not an ellipse.
     """
-
-    def project_target(points: np.ndarray) -> np.ndarray:
-        return project(points @ pose[:3, :3].T + pose[:3, 3])
-
-    return circle_centre_bias(project_target, points_mm, diameter_mm=diameter_mm, axis_u=_X, axis_v=_Y)
+    return circle_centre_bias(
+        lambda points: project(points @ pose[:3, :3].T + pose[:3, 3]), points_mm, diameter_mm=diameter_mm
+    )
 
 
 def _group_views(

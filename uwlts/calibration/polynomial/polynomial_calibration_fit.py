@@ -45,15 +45,6 @@ class LinePolynomials:
         """Return the root mean square residual of the inliers."""
         return float(np.sqrt(np.mean(self.residuals[self.used] ** 2)))
 
-    def evaluate(self, lines: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Return the values (N,) on lines (N,) at positions x (N,); NaN outside the lines and positions of the data."""
-        rows, (low, high) = lines - self.first_line, self.range
-        known = (rows >= 0) & (rows < len(self.coefficients)) & (x >= low) & (x <= high)
-        values = np.full(len(x), np.nan)
-        coefficients = self.coefficients[rows[known]].T
-        values[known] = legendre.legval(_scale_range(x[known], low, high), coefficients, tensor=False)
-        return values
-
 
 def fit_line_polynomials(lines: np.ndarray, x: np.ndarray, y: np.ndarray, *, degree: int) -> LinePolynomials:
     """Fit polynomials y(x) of all lines by least squares; coefficients are polynomials of the line number.

@@ -24,7 +24,6 @@ from uwlts.targets.detection.ellipses import circle_centre_bias
 _HIGHEST_DEGREE = 5
 _LOWEST_DEGREE = 3
 _POINTS_PER_TERM = 3
-_X, _Y = np.eye(3)[:2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +43,7 @@ class SmoothMap:
 
     def coarsely(self, points: np.ndarray) -> np.ndarray:
         """Map points (M, 2) with the homography only, which extrapolates well."""
-        return _project(self.homography, points)
+        return cv2.perspectiveTransform(points[:, None], self.homography)[:, 0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,9 +76,7 @@ def fit_plate_map(image: TargetImage, *, circle_diameter_mm: float | None = None
     points, pixels = image.points_mm, image.pixels
     if circle_diameter_mm is not None:
         to_image = fit_smooth_map(points[:, :2], pixels)
-        pixels = pixels - circle_centre_bias(
-            lambda rim: to_image(rim[:, :2]), points, diameter_mm=circle_diameter_mm, axis_u=_X, axis_v=_Y
-        )
+        pixels = pixels - circle_centre_bias(lambda rim: to_image(rim[:, :2]), points, diameter_mm=circle_diameter_mm)
     return PlateMap(**vars(fit_smooth_map(pixels, points[:, :2])), hull=ConvexHull(points[:, :2]).equations)
 
 
@@ -99,14 +96,9 @@ def fit_smooth_map(start: np.ndarray, end: np.ndarray) -> SmoothMap:
     if found is None or not np.isfinite(found).all():
         raise CalibrationError(f"the {len(start)} points of the target determine no homography from image to target")
     low, high = start.min(axis=0), start.max(axis=0)
-    left, terms = end - _project(found, start), _terms(start, low, high, degree)
+    left, terms = end - cv2.perspectiveTransform(start[:, None], found)[:, 0], _terms(start, low, high, degree)
     coefficients = np.linalg.lstsq(terms, left, rcond=None)[0]
     return SmoothMap(found, low, high, degree, coefficients, left - terms @ coefficients)
-
-
-def _project(homography: np.ndarray, points: np.ndarray) -> np.ndarray:
-    mapped = np.column_stack([points, np.ones(len(points))]) @ homography.T
-    return mapped[:, :2] / mapped[:, 2:]
 
 
 def _terms(points: np.ndarray, low: np.ndarray, high: np.ndarray, degree: int) -> np.ndarray:

@@ -425,7 +425,7 @@ def measure_marks(image, circles, *, mark_over_circle):
 RIM_POINTS = 16  # projected points on the rim of a circle
 
 
-def circle_centre_bias(project, centres_mm, *, diameter_mm, axis_u, axis_v):
+def circle_centre_bias(project, centres_mm, *, diameter_mm):
     """Return the offset of the centre of a circle's image from the image of the circle's centre.
 
     A detected centre minus this offset is the image of the circle's centre. For a pinhole camera the image is an
@@ -439,9 +439,7 @@ def circle_centre_bias(project, centres_mm, *, diameter_mm, axis_u, axis_v):
     centres_mm : (N, 3) array
         Centres of the circles, target frame.
     diameter_mm : float
-        Diameter of the circles.
-    axis_u, axis_v : (3,) array
-        Orthonormal vectors in the plane of the circles.
+        Diameter of the circles, which are in planes of constant z.
 
     Returns
     -------
@@ -451,19 +449,13 @@ def circle_centre_bias(project, centres_mm, *, diameter_mm, axis_u, axis_v):
     Raises
     ------
     RangeError
-        The diameter is not positive, the axes are not orthonormal, or the image of a circle is not an ellipse: the
-        circle extends behind the camera, or `project` fails.
+        The image of a circle is not an ellipse: the circle extends behind the camera, or `project` fails.
     """
-    axes = np.array([axis_u, axis_v], float)
-    if not np.allclose(axes @ axes.T, np.eye(2), rtol=0, atol=1e-9):
-        raise RangeError(f"axis_u and axis_v are {axes[0]} and {axes[1]}; expected orthonormal vectors")
-    if not (np.isfinite(diameter_mm) and diameter_mm > 0):
-        raise RangeError(f"the diameter is {diameter_mm} mm; expected a positive length")
     centres = np.asarray(centres_mm, float).reshape(-1, 3)
     if len(centres) == 0:
         return np.empty((0, 2))
     angle = np.arange(RIM_POINTS) * (2 * np.pi / RIM_POINTS)
-    rim = diameter_mm / 2 * np.stack([np.cos(angle), np.sin(angle)], 1) @ axes
+    rim = diameter_mm / 2 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
     points = np.concatenate([centres[:, None], centres[:, None] + rim], 1)
     pixels = np.asarray(project(points.reshape(-1, 3)), float).reshape(len(centres), RIM_POINTS + 1, 2)
     broken = ~np.isfinite(pixels).all((1, 2))
