@@ -153,15 +153,10 @@ class PeakWindow(NamedTuple):
         window = np.empty((count, size), np.float32)
         return cls(np.empty(count, np.intp), window, *numbers, smoothing=smoothing)
 
-    def select(self, which: np.ndarray) -> PeakWindow:
-        """Return the windows selected by a boolean mask or by indices."""
+    def select(self, which: np.ndarray | slice) -> PeakWindow:
+        """Return the windows selected by a boolean mask, by indices or by a slice."""
         *values, smoothing = self
         return PeakWindow(*(value[which] for value in values), smoothing=smoothing)
-
-    def first(self, count: int) -> PeakWindow:
-        """Return the first ``count`` windows."""
-        *values, smoothing = self
-        return PeakWindow(*(value[:count] for value in values), smoothing=smoothing)
 
     def smooth(self) -> np.ndarray:
         """Return the windows (M, W) float32 after the low-pass."""

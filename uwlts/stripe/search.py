@@ -118,7 +118,7 @@ def search_profiles(
     status = np.full(lines, _NO_STRIPE, np.uint8)
     wide, several = np.zeros((2, lines), np.bool_)
     count = _search_lines(profiles, board, *_make_buffers(peaks), rules, status, wide, several, peaks)
-    return status, wide, several, peaks.first(count)
+    return status, wide, several, peaks.select(slice(count))
 
 
 def _allocate_windows(count: int, rules: SearchRules) -> PeakWindow:
@@ -153,7 +153,7 @@ def search_all(
     if fewest > 1:
         kept = kept[np.bincount(found[kept])[found[kept]] >= fewest]
     if not kept.size:
-        return found[:0], clear[:0], peaks.first(0)
+        return found[:0], clear[:0], peaks.select(slice(0))
     return found[kept], clear[kept], peaks.select(kept)
 
 
