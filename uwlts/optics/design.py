@@ -25,15 +25,15 @@ from typing import Any
 import numpy as np
 
 from uwlts.errors import DesignError
+from uwlts.model.calibration import CameraModel
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Camera, Medium, Sensor, Window
+from uwlts.optics.camera import directions
 
 Array = Any  # NumPy array, Dr.Jit array, or number
 Vector = tuple[Array, Array, Array]
 
 _NEWTON_STEPS = 4  # of the ray through the window; converges quadratically
-_UNDISTORTING_STEPS = 100  # largest number of iterations; strong distortion converges slowly
-_UNDISTORTED_PX = 1e-3  # tolerance of undistorted points, sufficient for a drawing
 _TINY_MM = 1e-9  # offset that avoids an undefined direction for a point on the window's normal; negligible
 _EDGE_STEPS = 5  # Newton steps to an edge of the image; converges quadratically from a close start
 _NEAREST_MM = 1.0  # least distance of the sheet's entry into the image from the window's outer face
@@ -262,28 +262,9 @@ class ImagePoints:
     jacobian: tuple[Array, Array, Array, Array]
 
 
-def distort(lens: Lens, a: Array, b: Array) -> tuple[Array, Array, Array]:
-    """Return image points (x, y) of slopes (a, b), and the radial factor; OpenCV's distortion model."""
-    r2 = a * a + b * b
-    radial, _ = lens.radial(r2)
-    x = a * radial + 2 * lens.p1 * a * b + lens.p2 * (r2 + 2 * a * a)
-    y = b * radial + 2 * lens.p2 * a * b + lens.p1 * (r2 + 2 * b * b)
-    return x, y, radial
-
-
-def undistort_pixels(lens: Lens, pixels: np.ndarray) -> np.ndarray:
-    """Return the rays (N, 3) of pixels (N, 2), undistorted by fixed-point iteration; NaN without convergence."""
-    wanted = (pixels - (lens.cx, lens.cy)) / (lens.fx_px, lens.fy_px)
-    found = wanted.copy()
-    missed = np.full(len(found), np.inf)
-    with np.errstate(all="ignore"):
-        for _ in range(_UNDISTORTING_STEPS):
-            x, y, radial = distort(lens, *found.T)
-            image = np.stack([x, y], axis=1)
-            missed = np.abs(image - wanted).max(axis=1)
-            found += (wanted - image) / radial[:, None]
-        found[~(missed * lens.fx_px < _UNDISTORTED_PX)] = np.nan
-    return np.column_stack([found, np.ones(len(found))])
+def trace_pixels(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """Return the rays (N, 3) in air of pixels (N, 2) of a described camera; NaN beyond the domain of its distortion."""
+    return directions(CameraModel.from_description(camera), pixels)
 
 
 def project_points(xp: ModuleType, lens: Lens, window: WindowGeometry, point: Vector) -> ImagePoints:
@@ -291,9 +272,11 @@ def project_points(xp: ModuleType, lens: Lens, window: WindowGeometry, point: Ve
     path = trace_to_points(xp, window, point)
     ray = add_vectors(window.normal, scale_vector(path.across, path.slope))
     a, b = ray[0] / ray[2], ray[1] / ray[2]
+    # OpenCV's distortion model.
     r2 = a * a + b * b
-    x, y, radial = distort(lens, a, b)
-    _, slope = lens.radial(r2)
+    radial, slope = lens.radial(r2)
+    x = a * radial + 2 * lens.p1 * a * b + lens.p2 * (r2 + 2 * a * a)
+    y = b * radial + 2 * lens.p2 * a * b + lens.p1 * (r2 + 2 * b * b)
     mixed = slope * a * b + 2 * lens.p1 * a + 2 * lens.p2 * b
     jacobian = (
         lens.fx_px * (radial + slope * a * a + 2 * lens.p1 * b + 6 * lens.p2 * a),

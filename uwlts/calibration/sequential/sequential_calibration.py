@@ -184,10 +184,10 @@ def gather(
     )
 
 
-def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolution | None = None) -> CalibrationResult:
-    """Calibrate from gathered evidence, optionally near ``start``; errors as `calibrate_sequentially`."""
+def solve(evidence: Evidence, *, options: CalibrationOptions) -> CalibrationResult:
+    """Calibrate from gathered evidence; errors as `calibrate_sequentially`."""
     sensor = evidence.sensor
-    camera, lens, found, doubts = _calibrate_camera(evidence, options, start)
+    camera, lens, found, doubts = _calibrate_camera(evidence, options)
     if found.no_stripe:
         raise CalibrationError(found.no_stripe)
     stripe_points = points_on_target(camera.model, found.stripes, camera.target_poses, plate_mm=found.target.plate_mm)
@@ -262,9 +262,9 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
 
 
 def _calibrate_camera(
-    evidence: Evidence, options: CalibrationOptions, start: CameraSolution | None
+    evidence: Evidence, options: CalibrationOptions
 ) -> tuple[CameraSolution, LensCalibration | None, AirEvidence, list[str]]:
-    """Calibrate the camera from the images of the target, near ``start`` if given, or with lens selection.
+    """Calibrate the camera from the images of the target, with lens selection if that is wanted.
 
     Return the camera, the selected lens or None, the used images, and warnings.
     """
@@ -278,7 +278,7 @@ def _calibrate_camera(
 
     def size_doubts(images: Sequence[TargetImage], estimated: CameraOptions) -> list[str]:
         # Refraction in the focal length would change with distance.
-        if start is not None or options.poses == "free" or evidence.medium_kind != "air":
+        if options.poses == "free" or evidence.medium_kind != "air":
             return []
         with suppress(CalibrationError):
             free = solved(images, poses="free", options=estimated)
@@ -287,7 +287,7 @@ def _calibrate_camera(
 
     if options.lens is None:
         estimated = options.camera.with_described_pixels(evidence.sensor.camera)
-        camera = solved(air.images, poses=options.poses, options=estimated, start=start)
+        camera = solved(air.images, poses=options.poses, options=estimated)
         return camera, None, air, size_doubts(air.images, estimated)
     lens = calibrate_lens(
         air.images,

@@ -12,14 +12,14 @@ from tests.oracles.fermat import directions_seen, plate
 from tests.uwlts.calibration_views import WATER, built_sensor, inside, lattice, lens_of, turn
 from uwlts.calibration.camera.camera_parameters import TargetImage
 from uwlts.calibration.capture_evidence import AirEvidence
-from uwlts.calibration.polynomial.polynomial_calibration_fit import (
+from uwlts.calibration.polynomial.polynomial_calibration import (
     MOST_SMOOTH,
     calibrate_polynomials,
     fit_line_polynomials,
+    fit_plate_map,
     fit_polynomials,
     line_domains,
 )
-from uwlts.calibration.polynomial.polynomial_evidence import fit_plate_map
 from uwlts.cli.command_options import app
 from uwlts.errors import CalibrationError, CaptureError, RangeError
 from uwlts.model.placement import camera_from_object
