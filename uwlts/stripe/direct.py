@@ -71,10 +71,11 @@ def direct_stripe(
     kept = long | ~np.isin(line, line[long])
     line, number, centre, amplitude, width = (each[kept] for each in (line, number, *columns))
     number = np.unique(number, return_inverse=True)[1]
-    single, state = np.bincount(line)[line] == 1, np.empty(len(line), np.int8)
+    single = np.bincount(line)[line] == 1
     before, after = np.empty((2, len(line)))
     _fit_slopes(line, centre, number, rule.gap_lines, before, after)
-    _take_best(line, _path_margins(line, centre, number, before, after, jump_px, rule), single, rule.margin, state)
+    costs = _path_margins(line, centre, number, before, after, jump_px, rule)
+    state = _take_best(line, costs, single, rule.margin)
     _refuse_single_runs(number, single, state)
     reach_px = rule.meeting_jumps * jump_px
     _open_meetings(line, centre, number, before, after, rule.meeting_lines, reach_px, state)
@@ -186,31 +187,19 @@ def _compute_costs(
         best_of_line = min(best_of_line, best + 1.0)
 
 
-@compiled
-def _take_best(line: np.ndarray, cost: np.ndarray, alone: np.ndarray, margin: float, state: np.ndarray) -> None:
-    """Take the candidate on the best path of each line, if other paths cost more by the margin.
+def _take_best(line: np.ndarray, cost: np.ndarray, alone: np.ndarray, margin: float) -> np.ndarray:
+    """Return states (M,): the candidate on the best path of each line is taken if others cost more by the margin.
 
     Candidates that are alone are taken.
     """
-    first = 0
-    while first < line.size:
-        last = first
-        while last < line.size and line[last] == line[first]:
-            state[last] = _TAKEN
-            last += 1
-        if not alone[first]:
-            best, second = first, np.inf
-            for k in range(first + 1, last):
-                if cost[k] < cost[best]:
-                    second, best = cost[best], k
-                else:
-                    second = min(second, cost[k])
-            clear = second - cost[best] >= margin
-            for k in range(first, last):
-                state[k] = _REFUSED if cost[k] > margin and (clear or cost[best] > margin) else _OPEN
-            if clear and cost[best] <= margin:
-                state[best] = _TAKEN
-        first = last
+    order, first = np.lexsort((cost, line)), np.flatnonzero(np.diff(line, prepend=-1))
+    best, second = order[first], order[np.minimum(first + 1, len(order) - 1)]
+    clear, good = cost[second] - cost[best] >= margin, cost[best] <= margin
+    refused = np.repeat(clear | ~good, np.diff(first, append=len(line))) & (cost > margin)
+    state = np.where(refused, _REFUSED, _OPEN)
+    state[best[clear & good]] = _TAKEN
+    state[alone] = _TAKEN
+    return state
 
 
 @compiled_with_arrays

@@ -147,11 +147,11 @@ class PeakWindow(NamedTuple):
     smoothing: float
 
     @classmethod
-    def empty(cls, count: int, size: int, smoothing: float) -> PeakWindow:
-        """Allocate ``count`` windows of ``size`` pixels."""
+    def empty(cls, count: int, rules: SearchRules) -> PeakWindow:
+        """Allocate windows for ``count`` peaks."""
+        window = np.empty((count, 2 * rules.half + rules.block), np.float32)
         numbers = np.empty((6, count), np.float32)
-        window = np.empty((count, size), np.float32)
-        return cls(np.empty(count, np.intp), window, *numbers, smoothing=smoothing)
+        return cls(np.empty(count, np.intp), window, *numbers, smoothing=rules.smoothing)
 
     def select(self, which: np.ndarray | slice) -> PeakWindow:
         """Return the windows selected by a boolean mask, by indices or by a slice."""

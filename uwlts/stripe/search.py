@@ -114,16 +114,11 @@ def search_profiles(
         stripe (L,); and the windows of the lines with a stripe, in their order.
     """
     lines = profiles.shape[1]
-    peaks = _allocate_windows(lines, rules)
+    peaks = PeakWindow.empty(lines, rules)
     status = np.full(lines, _NO_STRIPE, np.uint8)
     wide, several = np.zeros((2, lines), np.bool_)
     count = _search_lines(profiles, board, *_make_buffers(peaks), rules, status, wide, several, peaks)
     return status, wide, several, peaks.select(slice(count))
-
-
-def _allocate_windows(count: int, rules: SearchRules) -> PeakWindow:
-    """Allocate windows for ``count`` peaks."""
-    return PeakWindow.empty(count, 2 * rules.half + rules.block, rules.smoothing)
 
 
 def _make_buffers(peaks: PeakWindow) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -147,7 +142,7 @@ def search_all(
     the border.
     """
     rules, most = rules._replace(order=FIRST), _RULE.most_stripes * len(lines)
-    peaks, found, clear = _allocate_windows(most, rules), np.empty(most, np.intp), np.empty(most, np.bool_)
+    peaks, found, clear = PeakWindow.empty(most, rules), np.empty(most, np.intp), np.empty(most, np.bool_)
     count = _search_all(profiles, board, lines, *_make_buffers(peaks), rules, found, clear, peaks)
     kept = np.flatnonzero(found[:count] >= 0)
     if fewest > 1:
