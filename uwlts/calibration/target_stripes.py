@@ -173,16 +173,8 @@ def doubt_sheet_at_rest(
 ) -> list[str]:
     """Return a warning for each capture in which the sheet moved from one image to the next.
 
-    Parameters
-    ----------
-    names
-        Capture and frame of each image, in their order.
-    pixels, off
-        Stripe of each image, in pixels or on any other scale (N, 2), and its distances (N,) from the sheet of all.
-    across
-        Coordinate across the stripe, 0 or 1.
-    unit
-        Unit of the distances.
+    ``names`` are capture and frame of each image. Its stripe is given in pixels or on any other scale (N, 2), and by
+    distances ``off`` (N,) from the sheet of all, with their ``unit``. ``across`` is the coordinate across the stripe.
     """
     captures: dict[str, list[int]] = {}
     for number, name in enumerate(names):

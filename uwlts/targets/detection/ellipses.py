@@ -396,24 +396,11 @@ def circle_centre_bias(project, centres_mm, *, diameter_mm):
     ellipse and the offset is exact (J. Heikkila and O. Silven, A four-step camera calibration procedure, CVPR 1997,
     section 3.2). With distortion or refraction, the ellipse is fitted to the projected rim.
 
-    Parameters
-    ----------
-    project : callable
-        Maps points (M, 3) in mm, target frame, to pixels (M, 2).
-    centres_mm : (N, 3) array
-        Centres of the circles, target frame.
-    diameter_mm : float
-        Diameter of the circles, which are in planes of constant z.
+    ``project`` maps points (M, 3) in mm, target frame, to pixels (M, 2). The circles with ``centres_mm`` (N, 3) are in
+    planes of constant z. Returns (N, 2) float64, (u, v) in px.
 
-    Returns
-    -------
-    (N, 2) float64
-        Offsets (u, v), px.
-
-    Raises
-    ------
-    RangeError
-        The image of a circle is not an ellipse: the circle extends behind the camera, or `project` fails.
+    Raises RangeError if the image of a circle is not an ellipse: the circle extends behind the camera, or ``project``
+    fails.
     """
     centres = np.asarray(centres_mm, float).reshape(-1, 3)
     if len(centres) == 0:
