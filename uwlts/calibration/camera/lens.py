@@ -173,22 +173,15 @@ def calibrate_lens(
 ) -> LensCalibration:
     """Calibrate a lens from images of a flat target.
 
-    Parameters
-    ----------
-    images, width_px, height_px, poses, approaching, circle_diameter_mm
-        As for `solve_camera`.
-    choice
-        Parameters to estimate. If the stage's direction is wrongly assumed to be the target's normal, this has the same
-        effect as another lens. With the poses "stage-normal", "auto" therefore is k1 and k2; with both stage poses,
-        pixels are square. Wide lenses, with points more than `WIDE_DEG` from the axis, usually have k1 k2 k4 k5: a
-        rational function follows the arctangent, which a polynomial cannot.
-    progress
-        Called with the number of models tried and the total.
+    ``choice`` states the parameters to estimate. If the stage's direction is wrongly assumed to be the target's normal,
+    this has the same effect as another lens. With the poses "stage-normal", "auto" therefore is k1 and k2; with both
+    stage poses, pixels are square. Wide lenses, with points more than `WIDE_DEG` from the axis, usually have k1 k2 k4
+    k5: a rational function follows the arctangent, which a polynomial cannot.
 
-    Raises
-    ------
-    CalibrationError
-        The images determine no model, or contradict each other.
+    ``progress`` is called with the number of models tried and the total; the other parameters are those of
+    `solve_camera`.
+
+    Raises CalibrationError if the images determine no model, or contradict each other.
     """
 
     solve_centres = partial(solve_camera, width_px=width_px, height_px=height_px, poses=poses, approaching=approaching)

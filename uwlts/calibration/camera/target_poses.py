@@ -25,6 +25,8 @@ from uwlts.model.calibration import CameraModel
 from uwlts.optics.camera import project
 from uwlts.targets.detection.ellipses import circle_centre_bias
 
+Poses = Literal["stage-normal", "stage", "free"]
+
 # Coordinates are normalised: a direction with an extent of the points below this fraction of the largest one, or
 # a null vector separated from others by less than this, cannot be distinguished from rounding and lens distortion.
 _FLAT = 1e-4
@@ -86,35 +88,30 @@ def _normalise(coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return similarity, np.column_stack([coordinates, np.ones(len(coordinates))]) @ similarity.T
 
 
-def _linear_start(views: list[Placement], intrinsics: Intrinsics) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Estimate camera parameters (P,) and poses (6,) of a target that the stage moves along its normal.
+def _find_start(views: list[Placement], intrinsics: Intrinsics, poses: Poses) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Estimate camera parameters (P,) and poses (6,).
 
-    The placement with the largest motion gives both by the linear method; the poses of the others follow.
+    If the stage moves the target along its normal, the placement with the largest motion gives both by the linear
+    method. From single images, f follows from homographies and the principal point is the centre (see
+    `cv2.initCameraMatrix2D`, after Zhang, A flexible new technique for camera calibration, PAMI 2000).
     """
-    farthest = int(np.argmax([np.ptp(view.shifts_mm) for view in views]))
-    matrix, rotation, translation = direct_linear(views[farthest].displace(), views[farthest].pixels)
-    global_values = intrinsics.from_matrix(matrix)
-    poses = [placement_pose(view, intrinsics.matrix(global_values)) for view in views]
-    poses[farthest] = np.r_[cv2.Rodrigues(rotation)[0].ravel(), translation]
-    return global_values, poses
-
-
-def _planar_start(views: list[Placement], intrinsics: Intrinsics) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Estimate camera parameters (P,) and poses (6,) of single images, with f from homographies.
-
-    The principal point is the centre. See `cv2.initCameraMatrix2D`, after Zhang, A flexible new technique for camera
-    calibration, PAMI 2000.
-    """
-    size = (intrinsics.width_px, intrinsics.height_px)
-    points, pixels = ([getattr(v, name).astype(np.float32) for v in views] for name in ("points_mm", "pixels"))
-    matrix = cv2.initCameraMatrix2D(points, pixels, size, 1.0)
-    if not (np.isfinite(matrix).all() and 0.1 < matrix[0, 0] / max(size) < 100):
-        raise CalibrationError(
-            "the target images do not determine the focal length: tilt the target differently relative to the camera's "
-            "axis in each image"
-        )
-    global_values = intrinsics.from_matrix(matrix)
-    return global_values, [placement_pose(view, intrinsics.matrix(global_values)) for view in views]
+    known = {}
+    if poses == "free":
+        size = (intrinsics.width_px, intrinsics.height_px)
+        points, pixels = ([getattr(v, name).astype(np.float32) for v in views] for name in ("points_mm", "pixels"))
+        matrix = cv2.initCameraMatrix2D(points, pixels, size, 1.0)
+        if not (np.isfinite(matrix).all() and 0.1 < matrix[0, 0] / max(size) < 100):
+            raise CalibrationError(
+                "the target images do not determine the focal length: tilt the target differently relative to the "
+                "camera's axis in each image"
+            )
+    else:
+        farthest = int(np.argmax([np.ptp(view.shifts_mm) for view in views]))
+        matrix, rotation, translation = direct_linear(views[farthest].displace(), views[farthest].pixels)
+        known[farthest] = np.r_[cv2.Rodrigues(rotation)[0].ravel(), translation]
+    values = intrinsics.from_matrix(matrix)
+    matrix = intrinsics.matrix(values)
+    return values, [known[n] if n in known else placement_pose(view, matrix) for n, view in enumerate(views)]
 
 
 def placement_pose(placement: Placement, matrix: np.ndarray) -> np.ndarray:
@@ -124,8 +121,6 @@ def placement_pose(placement: Placement, matrix: np.ndarray) -> np.ndarray:
         raise CalibrationError("no pose of the target fits one of its images: is it the right target?")
     return np.r_[rotation.ravel(), translation.ravel()]
 
-
-Poses = Literal["stage-normal", "stage", "free"]
 
 # Largest standard deviations relative to f and to the image's side: lengths would have the same relative errors.
 _LARGEST_FOCAL_STD = 0.02
@@ -212,33 +207,18 @@ def solve_camera(
     The stage moves the sensor by s along d, so the target moves by -s d relative to the sensor. A point x of the target
     is at R (x - (s - s0) d) + t in the camera frame, with d in the target's frame.
 
-    Parameters
-    ----------
-    images
-        Target points in each image.
-    width_px, height_px
-        Size of the images.
-    poses : {"stage-normal", "stage", "free"}
-        "stage-normal" (the thesis): one pose per placement of the target, d is the target's normal. "stage": d is
-        estimated too, for each placement; this needs pixels of known shape. "free": one pose per image, stage positions
-        are not used.
-    approaching
-        Whether increasing stage positions move the sensor towards the target; unused for "free".
-    options
-        Parameters to estimate.
-    start
-        Solution for nearly the same pixels, with the same options and poses.
-    circle_diameter_mm
-        The pixels are centres of images of circles with this diameter. Their offsets from the images of the circles'
-        centres are corrected iteratively.
+    With the ``poses`` "stage-normal" (the thesis) there is one pose per placement of the target, and d is the target's
+    normal. "stage": d is estimated too, for each placement; this needs pixels of known shape. "free": one pose per
+    image, stage positions are not used. ``approaching`` tells whether increasing stage positions move the sensor
+    towards the target; it is unused for "free".
 
-    Raises
-    ------
-    CalibrationError
-        There are too few images, the stage did not move, or the target is mirrored relative to the stage. The
-        parameters are not determined, or the offsets do not converge.
-    RangeError
-        A circle's image is not an ellipse.
+    ``start`` is a solution for nearly the same pixels, with the same options and poses. If the pixels are centres of
+    images of circles with ``circle_diameter_mm``, their offsets from the images of the circles' centres are corrected
+    iteratively.
+
+    Raises CalibrationError if there are too few images, the stage did not move, or the target is mirrored relative to
+    the stage. The same if the parameters are not determined, or the offsets do not converge; RangeError if a circle's
+    image is not an ellipse.
     """
     options = CameraOptions() if options is None else options
     intrinsics = Intrinsics(options, width_px=width_px, height_px=height_px)
@@ -248,8 +228,7 @@ def solve_camera(
         if start is not None:
             global_values, local = intrinsics.from_model(start.model), [_restart(view, start, poses) for view in views]
         else:
-            found = _planar_start if poses == "free" else _linear_start
-            global_values, local = found(views, intrinsics)
+            global_values, local = _find_start(views, intrinsics, poses)
             local = [np.r_[pose, 0.0, 0.0] if poses == "stage" else pose for pose in local]
 
         def model(group: int, global_values: np.ndarray, local: np.ndarray) -> Observation | None:

@@ -57,21 +57,7 @@ class SmoothMap:
         return cv2.perspectiveTransform(points[:, None], self.homography)[:, 0]
 
 
-@dataclass(frozen=True, eq=False)
-class PlateMap(SmoothMap):
-    """Map from pixels to the plane of the target (plate) in mm, fitted to the target's points.
-
-    ``hull`` (K, 3) contains the sides of the points' convex hull on the plate: outward normal and offset in mm.
-    """
-
-    hull: np.ndarray
-
-    def beyond_mm(self, pixels: np.ndarray) -> np.ndarray:
-        """Return the distances (M,) in mm of pixels (M, 2) outside the hull of the target's points; negative inside."""
-        return np.max(self.coarsely(pixels) @ self.hull[:, :2].T + self.hull[:, 2], axis=1)
-
-
-def fit_plate_map(image: TargetImage, *, circle_diameter_mm: float | None = None) -> PlateMap:
+def fit_plate_map(image: TargetImage, *, circle_diameter_mm: float | None = None) -> SmoothMap:
     """Fit the map from pixels to the plate to the points of one image.
 
     For circles, the pixels are centres of the circles' images. The offsets from the images of the circles' centres are
@@ -84,7 +70,7 @@ def fit_plate_map(image: TargetImage, *, circle_diameter_mm: float | None = None
     if circle_diameter_mm is not None:
         to_image = fit_smooth_map(points[:, :2], pixels)
         pixels = pixels - circle_centre_bias(lambda rim: to_image(rim[:, :2]), points, diameter_mm=circle_diameter_mm)
-    return PlateMap(**vars(fit_smooth_map(pixels, points[:, :2])), hull=ConvexHull(points[:, :2]).equations)
+    return fit_smooth_map(pixels, points[:, :2])
 
 
 def fit_smooth_map(start: np.ndarray, end: np.ndarray) -> SmoothMap:
@@ -173,7 +159,7 @@ def common_header(captures: Sequence[Capture]) -> CaptureHeader:
 
 def stripes_on_plate(
     evidence: AirEvidence, header: CaptureHeader, degree: int
-) -> tuple[PlateStripes, list[PlateMap], list[str]]:
+) -> tuple[PlateStripes, list[SmoothMap], list[str]]:
     """Return stripe points on the plate near the target's points in the same image, the maps, and warnings.
 
     Points are used up to one spacing outside the hull of the target's points in the image, and up to half a spacing
@@ -194,9 +180,10 @@ def stripes_on_plate(
         except CalibrationError as error:
             warnings.append(f"stage position {image.stage_mm:g} mm: left out, {error}")
             continue
-        plate = plate_map(pixels)
+        plate, hull = plate_map(pixels), ConvexHull(image.points_mm[:, :2]).equations
+        beyond_mm = np.max(plate_map.coarsely(pixels) @ hull[:, :2].T + hull[:, 2], axis=1)
         in_pattern = (plate >= extent.min(axis=0) - spacing / 2) & (plate <= extent.max(axis=0) + spacing / 2)
-        on_plate = in_pattern.all(axis=1) & (plate_map.beyond_mm(pixels) <= spacing)
+        on_plate = in_pattern.all(axis=1) & (beyond_mm <= spacing)
         if on_plate.any():
             maps.append(plate_map)
             parts.append((pixels[on_plate], plate[on_plate], number, image.stage_mm))
