@@ -51,7 +51,7 @@ class LineTable:
 
         ``exact`` returns the values (N, K) for lines (N,) and centres (N,), both float. ``lines`` and ``places_px`` are
         the lowest and highest line and centre. The last two coefficients of the series are limited by ``tolerance``, a
-        number or (K,), or by the fraction ``share`` of each largest absolute value if that is larger.
+        number or (K,). The limit is at least the fraction ``share`` of each largest absolute value.
         """
         (line, half_lines), (place, half_places) = (
             (0.5 * (low + high), max(0.5 * (high - low), 0.5)) for low, high in (lines, places_px)

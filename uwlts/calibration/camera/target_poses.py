@@ -209,7 +209,7 @@ def solve_camera(
 
     With the ``poses`` "stage-normal" (the thesis) there is one pose per placement of the target, and d is the target's
     normal. "stage": d is estimated too, for each placement; this needs pixels of known shape. "free": one pose per
-    image, stage positions are not used. ``approaching`` tells whether increasing stage positions move the sensor
+    image, stage positions are not used. ``approaching`` states whether increasing stage positions move the sensor
     towards the target; it is unused for "free".
 
     ``start`` is a solution for nearly the same pixels, with the same options and poses. If the pixels are centres of
