@@ -5,7 +5,7 @@ from .calibration.calibrate import calibrate as calibrate
 from .calibration.camera.photographs import calibrate_camera as calibrate_camera
 from .calibration.joint.refresh import refresh as refresh
 from .calibration.mount.calibrate_mount import calibrate_mount as calibrate_mount
-from .calibration.polynomial.polynomial_calibration_fit import calibrate_polynomials as calibrate_polynomials
+from .calibration.polynomial.polynomial_calibration import calibrate_polynomials as calibrate_polynomials
 from .comparison.change import compare_clouds as compare_clouds
 from .comparison.surface_mesh import mesh as mesh
 from .desk.scan import scan as scan

@@ -136,8 +136,9 @@ def find_air_evidence(
     if not images:
         why = _explain_missing_target(captures, targets[0], reasons)
         raise CalibrationError(f"the target was found in no image of {_names(captures)}: {why}")
+    names = [capture.path.name for capture in captures]
     no_stripe = "" if any(map(len, stripes)) else explain_captures_without_stripe(captures)
-    return AirEvidence(targets[0], images, frames, stripes, warnings, no_stripe, outliers, _file_names(captures))
+    return AirEvidence(targets[0], images, frames, stripes, warnings, no_stripe, outliers, names)
 
 
 def step_evidence(
@@ -193,12 +194,8 @@ def explain_captures_without_stripe(captures: Sequence[Capture]) -> str:
     return f"no stripe in any of the {count} {where}: {reason}"
 
 
-def _file_names(captures: Sequence[Capture]) -> list[str]:
-    return [capture.path.name for capture in captures]
-
-
 def _names(captures: Sequence[Capture]) -> str:
-    return ", ".join(_file_names(captures))
+    return ", ".join(capture.path.name for capture in captures)
 
 
 def _explain_missing_target(captures: Sequence[Capture], target: Target, reasons: Counter[str]) -> str:

@@ -56,7 +56,7 @@ def stripe_on_target(
         return TargetStripe(np.empty((0, 2)), len(lines))
     near = curve.holds(lines, across)
     along_curve = np.arange(len(stripe.status))
-    expected = _on_plate(_pixels(along_curve, curve.evaluate(along_curve), stripe_along), to_plate, target)
+    expected = _on_plate(_pixels(along_curve, curve.polynomial(along_curve), stripe_along), to_plate, target)
     missing = np.setdiff1d(along_curve[expected], lines[near])
     outliers = int(np.count_nonzero(~near))
     lines, across = lines[near], across[near]
@@ -130,13 +130,9 @@ class _Curve:
                 break
         return curve
 
-    def evaluate(self, lines: np.ndarray) -> np.ndarray:
-        """Return positions across the stripe."""
-        return self.polynomial(lines)
-
     def holds(self, lines: np.ndarray, across: np.ndarray) -> np.ndarray:
         """Return a mask of the points on the curve."""
-        return np.abs(across - self.evaluate(lines)) <= self.limit_px
+        return np.abs(across - self.polynomial(lines)) <= self.limit_px
 
 
 def _near_curve(
@@ -152,7 +148,7 @@ def _near_curve(
     while options.half_window_px < min(width_px, options.widest_window_px):
         options = options.double_width()
     profiles = image if stripe_along == "height" else image.T
-    start = np.rint(curve.evaluate(np.arange(len(profiles)))).astype(int) - 2 * options.half_window_px
+    start = np.rint(curve.polynomial(np.arange(len(profiles)))).astype(int) - 2 * options.half_window_px
     columns = start[:, None] + np.arange(4 * options.half_window_px + 1)
     band = np.take_along_axis(profiles, columns.clip(0, profiles.shape[1] - 1), axis=1)
     found: Stripe = extract_stripe(band, stripe_along="height", saturation=saturation, options=options)
@@ -177,16 +173,8 @@ def doubt_sheet_at_rest(
 ) -> list[str]:
     """Return a warning for each capture in which the sheet moved from one image to the next.
 
-    Parameters
-    ----------
-    names
-        Capture and frame of each image, in their order.
-    pixels, off
-        Stripe of each image, in pixels or on any other scale (N, 2), and its distances (N,) from the sheet of all.
-    across
-        Coordinate across the stripe, 0 or 1.
-    unit
-        Unit of the distances.
+    ``names`` are capture and frame of each image. Its stripe is given in pixels or on any other scale (N, 2), and by
+    distances ``off`` (N,) from the sheet of all, with their ``unit``. ``across`` is the coordinate across the stripe.
     """
     captures: dict[str, list[int]] = {}
     for number, name in enumerate(names):

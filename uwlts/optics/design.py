@@ -24,23 +24,21 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.errors import DesignError, RangeError
+from uwlts.errors import DesignError
+from uwlts.model.calibration import CameraModel
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Camera, Medium, Sensor, Window
+from uwlts.optics.camera import directions
 
 Array = Any  # NumPy array, Dr.Jit array, or number
 Vector = tuple[Array, Array, Array]
 
 _NEWTON_STEPS = 4  # of the ray through the window; converges quadratically
-_UNDISTORTING_STEPS = 100  # largest number of iterations; strong distortion converges slowly
-_UNDISTORTED_PX = 1e-3  # tolerance of undistorted points, sufficient for a drawing
 _TINY_MM = 1e-9  # offset that avoids an undefined direction for a point on the window's normal; negligible
 _EDGE_STEPS = 5  # Newton steps to an edge of the image; converges quadratically from a close start
 _NEAREST_MM = 1.0  # least distance of the sheet's entry into the image from the window's outer face
 FARTHEST_MM = 1e6  # largest distance of the sheet's exit from the image, from the pupil; no water is transparent as far
-CLAMPED, UNCLAMPED = 0.75, 1.125
-"""K_w of thesis Eq. 3.2. Plate theory (Timoshenko) gives 3/4 for a clamped edge and 3 (3 + nu) / 8 for a supported one.
-The value 1.125 assumes Poisson's ratio nu = 0; glass with nu = 0.2 would have 1.2."""
+_CLAMPED = 0.75  # K_w of thesis Eq. 3.2 for a clamped edge, by plate theory (Timoshenko)
 DEPOLARISED_CONTRAST = math.sqrt(0.5)
 """Speckle contrast of a depolarising surface such as paint: the sum of two independent patterns of equal mean (Goodman,
 Speckle Phenomena in Optics, section 3.4)."""
@@ -264,28 +262,9 @@ class ImagePoints:
     jacobian: tuple[Array, Array, Array, Array]
 
 
-def distort(lens: Lens, a: Array, b: Array) -> tuple[Array, Array, Array]:
-    """Return image points (x, y) of slopes (a, b), and the radial factor; OpenCV's distortion model."""
-    r2 = a * a + b * b
-    radial, _ = lens.radial(r2)
-    x = a * radial + 2 * lens.p1 * a * b + lens.p2 * (r2 + 2 * a * a)
-    y = b * radial + 2 * lens.p2 * a * b + lens.p1 * (r2 + 2 * b * b)
-    return x, y, radial
-
-
-def undistort_pixels(lens: Lens, pixels: np.ndarray) -> np.ndarray:
-    """Return the rays (N, 3) of pixels (N, 2), undistorted by fixed-point iteration; NaN without convergence."""
-    wanted = (pixels - (lens.cx, lens.cy)) / (lens.fx_px, lens.fy_px)
-    found = wanted.copy()
-    missed = np.full(len(found), np.inf)
-    with np.errstate(all="ignore"):
-        for _ in range(_UNDISTORTING_STEPS):
-            x, y, radial = distort(lens, *found.T)
-            image = np.stack([x, y], axis=1)
-            missed = np.abs(image - wanted).max(axis=1)
-            found += (wanted - image) / radial[:, None]
-        found[~(missed * lens.fx_px < _UNDISTORTED_PX)] = np.nan
-    return np.column_stack([found, np.ones(len(found))])
+def trace_pixels(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """Return the rays (N, 3) in air of pixels (N, 2) of a described camera; NaN beyond the domain of its distortion."""
+    return directions(CameraModel.from_description(camera), pixels)
 
 
 def project_points(xp: ModuleType, lens: Lens, window: WindowGeometry, point: Vector) -> ImagePoints:
@@ -293,9 +272,11 @@ def project_points(xp: ModuleType, lens: Lens, window: WindowGeometry, point: Ve
     path = trace_to_points(xp, window, point)
     ray = add_vectors(window.normal, scale_vector(path.across, path.slope))
     a, b = ray[0] / ray[2], ray[1] / ray[2]
+    # OpenCV's distortion model.
     r2 = a * a + b * b
-    x, y, radial = distort(lens, a, b)
-    _, slope = lens.radial(r2)
+    radial, slope = lens.radial(r2)
+    x = a * radial + 2 * lens.p1 * a * b + lens.p2 * (r2 + 2 * a * a)
+    y = b * radial + 2 * lens.p2 * a * b + lens.p1 * (r2 + 2 * b * b)
     mixed = slope * a * b + 2 * lens.p1 * a + 2 * lens.p2 * b
     jacobian = (
         lens.fx_px * (radial + slope * a * a + 2 * lens.p1 * b + 6 * lens.p2 * a),
@@ -454,65 +435,36 @@ def scheimpflug_angle_rad(*, triangulation_angle_rad: float, magnification: floa
 
     Behind a flat window the sheet appears at tan theta = n tan theta_t, and k follows from the apparent distance.
     """
-    if not 0 < triangulation_angle_rad < math.pi / 2:
-        raise RangeError(f"the triangulation angle is {triangulation_angle_rad:g} rad; expected 0 to pi / 2")
-    _require_positive(magnification=magnification)
     return math.atan(math.tan(triangulation_angle_rad) / magnification)
 
 
-def speckle_limit_um(
-    *,
-    wavelength_nm: float,
-    focal_length_mm: float,
-    f_number: float,
-    distance_mm: float,
-    contrast: float = DEPOLARISED_CONTRAST,
-) -> float:
+def speckle_limit_um(*, wavelength_nm: float, focal_length_mm: float, f_number: float, distance_mm: float) -> float:
     """Return the standard uncertainty of a laser spot's position on the object because of speckle, in um.
 
-    The uncertainty across the camera's axis is C lambda / (2 pi sin u), with speckle contrast C (Dorsch, Haeusler and
-    Herrmann 1994, Applied Optics 33:1306). From the object, the pupil of diameter f / N appears under the half-angle u.
+    The uncertainty across the camera's axis is C lambda / (2 pi sin u), with the speckle contrast C of
+    `DEPOLARISED_CONTRAST` (Dorsch, Haeusler and Herrmann 1994, Applied Optics 33:1306). From the object, the pupil of
+    diameter f / N appears under the half-angle u.
 
     The uncertainty along the laser's axis is larger by 1 / sin theta_t. The thesis's 16 um at 250 mm is the value
     across the axis for a contrast of 1; its value in depth is 28 um.
 
     Behind a window, ``distance_mm`` is the apparent distance from the pupil.
     """
-    _require_positive(
-        wavelength_nm=wavelength_nm,
-        focal_length_mm=focal_length_mm,
-        f_number=f_number,
-        distance_mm=distance_mm,
-        contrast=contrast,
-    )
     sine = math.sin(math.atan(focal_length_mm / f_number / 2 / distance_mm))
-    return 1e-3 * contrast * wavelength_nm / (2 * math.pi * sine)
+    return 1e-3 * DEPOLARISED_CONTRAST * wavelength_nm / (2 * math.pi * sine)
 
 
-def window_thickness_mm(
-    *, pressure_mpa: Array, unsupported_diameter_mm: Array, strength_mpa: Array, support: float = CLAMPED
-) -> Array:
-    """Return the thickness of a round window, t = A / 2 sqrt(K_w f_s dP / S_f) (Harris 1999, thesis Eq. 3.2).
+def window_thickness_mm(*, pressure_mpa: Array, unsupported_diameter_mm: Array, strength_mpa: Array) -> Array:
+    """Return the thickness of a clamped round window, t = A / 2 sqrt(K_w f_s dP / S_f) (Harris 1999, thesis Eq. 3.2).
 
-    A is ``unsupported_diameter_mm``, dP ``pressure_mpa``, S_f ``strength_mpa``; K_w follows from the edge's
-    ``support``, and the safety factor f_s is 4.
+    A is ``unsupported_diameter_mm``, dP ``pressure_mpa``, S_f ``strength_mpa``, and the safety factor f_s is 4.
 
     The thesis prints 5.53 mm for 1 MPa without A, K_w and S_f. Its Figure 34 lists only fused silica (60 MPa). With
-    f_s = 4, the diameter A is then 49.5 mm if clamped and 40.4 mm if not. The bore of 63 mm would need 7.0 mm if
-    clamped.
+    f_s = 4, the diameter A is then 49.5 mm. The bore of 63 mm would need 7.0 mm.
     """
-    return 0.5 * unsupported_diameter_mm * np.sqrt(support * 4.0 * pressure_mpa / strength_mpa)
+    return 0.5 * unsupported_diameter_mm * np.sqrt(_CLAMPED * 4.0 * pressure_mpa / strength_mpa)
 
 
 def line_needed_mm(*, pipe_diameter_mm: float, passes: int) -> float:
     """Return the line length that covers a pipe's circumference: the inscribed polygon's side (thesis Figure 27)."""
-    _require_positive(pipe_diameter_mm=pipe_diameter_mm)
-    if passes < 2:
-        raise RangeError(f"passes is {passes}; a pipe's whole circumference needs at least 2")
     return pipe_diameter_mm * math.sin(math.pi / passes)
-
-
-def _require_positive(**values: float) -> None:
-    for name, value in values.items():
-        if not 0 < value < math.inf:
-            raise RangeError(f"{name} is {value:g}; expected a positive number")

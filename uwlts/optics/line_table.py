@@ -49,16 +49,9 @@ class LineTable:
     ) -> LineTable | None:
         """Tabulate a function, or return None if it is not finite everywhere or not smooth enough.
 
-        Parameters
-        ----------
-        exact
-            Function that returns the values (N, K) for lines (N,) and centres (N,), both float.
-        lines, places_px : tuple
-            Lowest and highest line and centre, both included.
-        tolerance : float or (K,)
-            Limit of the last two coefficients of the series.
-        share : float
-            Relative tolerance: fraction of each largest absolute value. The larger of the two tolerances applies.
+        ``exact`` returns the values (N, K) for lines (N,) and centres (N,), both float. ``lines`` and ``places_px`` are
+        the lowest and highest line and centre. The last two coefficients of the series are limited by ``tolerance``, a
+        number or (K,). The limit is at least the fraction ``share`` of each largest absolute value.
         """
         (line, half_lines), (place, half_places) = (
             (0.5 * (low + high), max(0.5 * (high - low), 0.5)) for low, high in (lines, places_px)

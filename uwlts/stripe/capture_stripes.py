@@ -108,8 +108,11 @@ def find_stripe_direction(
     image: np.ndarray, *, stripe_along: str, saturation: float
 ) -> Literal["along", "across"] | None:
     """Return the direction of the stripes in an image (H, W): along the given side, across it, or None."""
-    along = _lines_with_stripe(image, stripe_along, saturation)
-    across = _lines_with_stripe(image, "height" if stripe_along == "width" else "width", saturation)
+    dark = StripeStatus.NO_STRIPE, StripeStatus.SATURATED
+    along, across = (
+        np.count_nonzero(~np.isin(_find_status(image, side, saturation), dark))
+        for side in (stripe_along, "height" if stripe_along == "width" else "width")
+    )
     if across >= FEWEST_LINES and across > _ACROSS_RATIO * along:
         return "across"
     return "along" if along >= FEWEST_LINES else None
@@ -159,9 +162,3 @@ def _find_status(image: np.ndarray, along: str, saturation: float) -> np.ndarray
         return direct_stripe_in(image, stripe_along=along, options=StripeOptions(), saturation=saturation).status
     except ImageError:
         return np.empty(0, np.uint8)
-
-
-def _lines_with_stripe(image: np.ndarray, along: str, saturation: float) -> int:
-    """Count the profile lines with one or more stripes."""
-    status = _find_status(image, along, saturation)
-    return int(np.count_nonzero((status != StripeStatus.NO_STRIPE) & (status != StripeStatus.SATURATED)))

@@ -50,9 +50,10 @@ class DirectRule:
     """Most lines omitted where stripes merge. 12 gives 0.66 %; 36 gives 0.36 % with 1 % more lines lost."""
 
 
-def direct_stripe(
-    stripe: Stripe, rivals: StripeCandidates, *, jump_px: float, rule: DirectRule = DirectRule()
-) -> Stripe:
+_RULE = DirectRule()
+
+
+def direct_stripe(stripe: Stripe, rivals: StripeCandidates, *, jump_px: float) -> Stripe:
     """Return the stripe of an image without reflections, including its ends.
 
     Lines without a unique choice become AMBIGUOUS. Candidates without a width cannot be measured: two merging stripes,
@@ -65,19 +66,20 @@ def direct_stripe(
     names = "centre_px", "amplitude", "width_px"
     columns = [np.concatenate([getattr(stripe, name)[alone], getattr(rivals, name)])[order] for name in names]
     line, number = line[order], np.empty(len(order), np.intp)
-    _number_stripes(line, columns[0], rule.gap_lines, jump_px, number)
+    _number_stripes(line, columns[0], _RULE.gap_lines, jump_px, number)
     # Short stripes are grains of speckle, unless they are alone.
-    long = np.bincount(number)[number] >= rule.fewest_lines
+    long = np.bincount(number)[number] >= _RULE.fewest_lines
     kept = long | ~np.isin(line, line[long])
     line, number, centre, amplitude, width = (each[kept] for each in (line, number, *columns))
     number = np.unique(number, return_inverse=True)[1]
-    single, state = np.bincount(line)[line] == 1, np.empty(len(line), np.int8)
+    single = np.bincount(line)[line] == 1
     before, after = np.empty((2, len(line)))
-    _fit_slopes(line, centre, number, rule.gap_lines, before, after)
-    _take_best(line, _path_margins(line, centre, number, before, after, jump_px, rule), single, rule.margin, state)
+    _fit_slopes(line, centre, number, _RULE.gap_lines, before, after)
+    costs = _path_margins(line, centre, number, before, after, jump_px)
+    state = _take_best(line, costs, single, _RULE.margin)
     _refuse_single_runs(number, single, state)
-    reach_px = rule.meeting_jumps * jump_px
-    _open_meetings(line, centre, number, before, after, rule.meeting_lines, reach_px, state)
+    reach_px = _RULE.meeting_jumps * jump_px
+    _open_meetings(line, centre, number, before, after, _RULE.meeting_lines, reach_px, state)
     taken = (state == _TAKEN) & np.isfinite(width)
     status = stripe.status.copy()
     status[line], status[line[taken]] = StripeStatus.AMBIGUOUS, StripeStatus.OK
@@ -86,13 +88,7 @@ def direct_stripe(
 
 
 def _path_margins(
-    line: np.ndarray,
-    centre: np.ndarray,
-    number: np.ndarray,
-    before: np.ndarray,
-    after: np.ndarray,
-    jump_px: float,
-    rule: DirectRule,
+    line: np.ndarray, centre: np.ndarray, number: np.ndarray, before: np.ndarray, after: np.ndarray, jump_px: float
 ) -> np.ndarray:
     """Return the cost (M,) of the best path through each candidate, in jumps more than the best path of all."""
     through, backwards = np.empty((2, len(line)))
@@ -100,8 +96,8 @@ def _path_margins(
     first, last = np.full(number.max() + 1, line.max()), np.zeros(number.max() + 1, line.dtype)
     np.minimum.at(first, number, line)
     np.maximum.at(last, number, line)
-    missed = rule.skipped * (np.bincount(number) / (last - first + 1))[number]
-    gap, skipped = rule.gap_lines, rule.skipped
+    missed = _RULE.skipped * (np.bincount(number) / (last - first + 1))[number]
+    gap, skipped = _RULE.gap_lines, _RULE.skipped
     _compute_costs(line, centre, before, after, missed, gap, jump_px, skipped, through)
     turned = (values[::-1].copy() for values in (line.max() - line, centre, -after, -before, missed))
     _compute_costs(*turned, gap=gap, jump_px=jump_px, skipped=skipped, result=backwards)
@@ -186,31 +182,19 @@ def _compute_costs(
         best_of_line = min(best_of_line, best + 1.0)
 
 
-@compiled
-def _take_best(line: np.ndarray, cost: np.ndarray, alone: np.ndarray, margin: float, state: np.ndarray) -> None:
-    """Take the candidate on the best path of each line, if other paths cost more by the margin.
+def _take_best(line: np.ndarray, cost: np.ndarray, alone: np.ndarray, margin: float) -> np.ndarray:
+    """Return states (M,): the candidate on the best path of each line is taken if others cost more by the margin.
 
     Candidates that are alone are taken.
     """
-    first = 0
-    while first < line.size:
-        last = first
-        while last < line.size and line[last] == line[first]:
-            state[last] = _TAKEN
-            last += 1
-        if not alone[first]:
-            best, second = first, np.inf
-            for k in range(first + 1, last):
-                if cost[k] < cost[best]:
-                    second, best = cost[best], k
-                else:
-                    second = min(second, cost[k])
-            clear = second - cost[best] >= margin
-            for k in range(first, last):
-                state[k] = _REFUSED if cost[k] > margin and (clear or cost[best] > margin) else _OPEN
-            if clear and cost[best] <= margin:
-                state[best] = _TAKEN
-        first = last
+    order, first = np.lexsort((cost, line)), np.flatnonzero(np.diff(line, prepend=-1))
+    best, second = order[first], order[np.minimum(first + 1, len(order) - 1)]
+    clear, good = cost[second] - cost[best] >= margin, cost[best] <= margin
+    refused = np.repeat(clear | ~good, np.diff(first, append=len(line))) & (cost > margin)
+    state = np.where(refused, _REFUSED, _OPEN)
+    state[best[clear & good]] = _TAKEN
+    state[alone] = _TAKEN
+    return state
 
 
 @compiled_with_arrays

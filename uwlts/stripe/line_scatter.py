@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from functools import lru_cache
 from types import ModuleType
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
-from uwlts.runtime.compiled import compiled
 from uwlts.stripe.peak_window import WINDOW_RULE, PeakWindow
 
 
@@ -77,41 +76,18 @@ def _measure_scatters(
 
     ``rows`` (R, K) are the lines of R runs. The distances are NaN if too few lines belong to a smooth stripe.
     """
-    some = peak.select(rows.ravel())
-    middle = (some.start + some.middle).reshape(rows.shape).astype(float)
-    jump_px, weights = _Rule.jump * peak.window.shape[1], _residual_weights(_Rule.reach)
-    scatters = []
-    for values in (centre[rows.ravel()], *(other.centres(some) for other in others)):
-        place = (some.start + values.astype(float)).reshape(rows.shape)
-        total, count = _sum_squares(middle, place, weights, jump_px, _Rule.largest_px)
-        scatters.append(math.sqrt(total / count) if count >= _Rule.fewest else math.nan)
+    some, reach = peak.select(rows.ravel()), _Rule.reach
+    middle = (some.start + some.middle).reshape(rows.shape)
+    broken = np.abs(np.diff(middle, axis=1)) > _Rule.jump * peak.window.shape[1]
+    # Lines without a jump to a neighbour within the reach.
+    smooth = ~sliding_window_view(broken, 2 * reach, axis=1).any(axis=2)
+    centres = [centre[rows.ravel()], *(other.centres(some) for other in others)]
+    places = np.reshape([some.start + values.astype(float) for values in centres], (-1, *rows.shape))
+    left = sliding_window_view(places, 2 * reach + 1, axis=2) @ _residual_weights(reach)
+    count = np.count_nonzero(smooth)
+    squares = np.minimum(np.abs(left[:, smooth]), _Rule.largest_px) ** 2
+    scatters = np.sqrt(squares.sum(axis=1) / count if count >= _Rule.fewest else np.full(len(places), np.nan)).tolist()
     return scatters[0], scatters[1:]
-
-
-@compiled
-def _sum_squares(
-    middle: np.ndarray, place: np.ndarray, weights: np.ndarray, jump_px: float, largest_px: float
-) -> tuple[float, int]:
-    """Return the sum of the squared, limited residuals of places (R, K), and the number of lines on smooth stripes.
-
-    The residual of a line is the sum of its neighbours' places with the weights (2 reach + 1,). A stripe is smooth if
-    the middles (R, K) of neighbouring lines are nowhere farther apart than ``jump_px``.
-    """
-    reach, total, count = weights.size // 2, 0.0, 0
-    for row in range(place.shape[0]):
-        broken = -1
-        for line in range(1, place.shape[1]):
-            if abs(middle[row, line] - middle[row, line - 1]) > jump_px:
-                broken = line
-            at = line - reach
-            if at < reach or broken > at - reach:
-                continue
-            residual = 0.0
-            for k in range(weights.size):
-                residual += weights[k] * place[row, at - reach + k]
-            total += min(abs(residual), largest_px) ** 2
-            count += 1
-    return total, count
 
 
 @lru_cache(maxsize=16)

@@ -22,27 +22,17 @@ class WindowRule(NamedTuple):
     """Numbers of the measurement of a peak; a named tuple, which compiled code reads as constants.
 
     They follow from the reasons below; tests/uwlts/stripe/test_unchanged.py keeps the results on drawn stripes.
-
-    Attributes
-    ----------
-    least_kernel : float
-        Sigma of the narrowest weight, px. A narrower weight covers too few pixels: for a stripe of sigma 0.7 px the
-        error of the centre with the pixel phase would be 0.015 px instead of 0.005 px.
-    flank : int
-        Pixels of background on either side of a peak, for two low-passed values at a distance of three pixels.
-    tail : float
-        Range of sums with Gaussian weights, in sigmas: further weights are below 0.0004 of the largest.
-    background : float
-        Distance of the background from a peak's middle, in sigmas: a Gaussian has fallen to 0.011 of its height.
-    low_pass : float
-        Range of the low-pass, in sigmas: its last weight is below 0.0022 of the largest.
     """
 
     least_kernel: float = 1.0
+    """Sigma of the narrowest weight, px. A narrower weight covers too few pixels: for a stripe of sigma 0.7 px the
+    error of the centre with the pixel phase would be 0.015 px instead of 0.005 px."""
     flank: int = 5
-    tail: float = 4.0
+    """Pixels of background on either side of a peak, for two low-passed values at a distance of three pixels."""
+    tail: float = 4.0  # range of sums with Gaussian weights, in sigmas: further weights are below 0.0004 of the largest
     background: float = 3.0
-    low_pass: float = 3.5
+    """Distance of the background from a peak's middle, in sigmas: a Gaussian has fallen to 0.011 of its height."""
+    low_pass: float = 3.5  # range of the low-pass, in sigmas: its last weight is below 0.0022 of the largest
 
 
 WINDOW_RULE = WindowRule()
@@ -53,115 +43,67 @@ LAST = 1  # order of `SearchRules` for the rule `PeakRule.LAST`
 
 
 class SearchRules(NamedTuple):
-    """Options of the search; lengths in px, heights in grey levels.
+    """Options of the search; lengths in px, heights in grey levels."""
 
-    Attributes
-    ----------
-    half, block : int
-        A window consists of a block and ``half`` pixels on either side.
-    smoothing : float
-        Sigma of the low-pass.
-    share : float
-        Height of a second peak, as a fraction of the first one's, that makes a window crowded. For the strongest stripe
-        the whole window is searched, otherwise the pixels used.
-    order : int
-        Rule for several stripes: `FIRST`, `STRONGEST` or `LAST`.
-    narrowest, widest : float
-        Range of a stripe's sigma.
-    coarse, fine : float
-        Least height of a block, and of a peak after the low-pass; lower ones are noise.
-    bright : float
-        Least height of a peak that is too wide to be measured and not haze.
-    """
-
+    # A window consists of a block and ``half`` pixels on either side.
     half: int
     block: int
-    smoothing: float
+    smoothing: float  # sigma of the low-pass
     share: float
-    order: int
+    """Height of a second peak, as a fraction of the first one's, that makes a window crowded. For the strongest
+    stripe the whole window is searched, otherwise the pixels used."""
+    order: int  # rule for several stripes: `FIRST`, `STRONGEST` or `LAST`
+    # Range of a stripe's sigma.
     narrowest: float
     widest: float
+    # Least height of a block, and of a peak after the low-pass; lower ones are noise
     coarse: float
     fine: float
-    bright: float
+    bright: float  # least height of a peak that is too wide to be measured and not haze
 
 
 class Peak(NamedTuple):
-    """Peak in a window; positions in px from the window's first pixel, heights in grey levels.
+    """Peak in a window; positions in px from the window's first pixel, heights in grey levels."""
 
-    Attributes
-    ----------
-    top : int
-        Highest pixel after the low-pass.
-    middle : float
-        Midpoint of the half-height crossings.
-    sigma : float
-        Half-height width divided by 2.355, without the low-pass (variances add).
-    reach : int
-        Number of pixels from ``middle`` to the first background pixel.
-    base, slope : float
-        Background at ``middle``, and its slope per px, from the flanks beyond ``reach``.
-    height : float
-        Height of the top above ``base``; above the lowest surroundings unless ``closed``.
-    closed : bool
-        Both half-height crossings are in the window.
-    crowded : bool
-        The profile rises again outside the crossings: above half height, or to the required fraction of the height
-        after a valley of half its own height.
-    """
-
-    top: int
-    middle: np.floating
-    sigma: float | np.floating
-    reach: int
+    top: int  # highest pixel after the low-pass
+    middle: np.floating  # midpoint of the half-height crossings
+    sigma: float | np.floating  # half-height width divided by 2.355, without the low-pass (variances add)
+    reach: int  # number of pixels from ``middle`` to the first background pixel
+    # Background at ``middle``, and its slope per px, from the flanks beyond ``reach``
     base: np.floating
     slope: np.floating
-    height: np.floating
-    closed: bool
+    height: np.floating  # height of the top above ``base``; above the lowest surroundings unless ``closed``
+    closed: bool  # both half-height crossings are in the window
     crowded: np.bool_
+    """The profile rises again outside the crossings: above half height, or to the required fraction of the height
+    after a valley of half its own height."""
 
 
 class PeakWindow(NamedTuple):
-    """Peaks in M windows of W pixels, in the form for compiled code.
+    """Peaks in M windows of W pixels, in the form for compiled code."""
 
-    Attributes
-    ----------
-    start : (M,) int
-        First pixel of each window on its line.
-    window : (M, W) float32
-        Pixels; beyond the image the border pixel is repeated.
-    middle, sigma, reach, base, slope, height : (M,) float32
-        See `Peak`.
-    smoothing : float
-        Sigma of the low-pass, px.
-    """
-
-    start: np.ndarray
-    window: np.ndarray
+    start: np.ndarray  # (M,); first pixel of each window on its line
+    window: np.ndarray  # (M, W) float32; pixels; beyond the image the border pixel is repeated
+    # (M,) float32; see `Peak`.
     middle: np.ndarray
     sigma: np.ndarray
     reach: np.ndarray
     base: np.ndarray
     slope: np.ndarray
     height: np.ndarray
-    smoothing: float
+    smoothing: float  # sigma of the low-pass, px
 
     @classmethod
-    def empty(cls, count: int, size: int, smoothing: float) -> PeakWindow:
-        """Allocate ``count`` windows of ``size`` pixels."""
+    def empty(cls, count: int, rules: SearchRules) -> PeakWindow:
+        """Allocate windows for ``count`` peaks."""
+        window = np.empty((count, 2 * rules.half + rules.block), np.float32)
         numbers = np.empty((6, count), np.float32)
-        window = np.empty((count, size), np.float32)
-        return cls(np.empty(count, np.intp), window, *numbers, smoothing=smoothing)
+        return cls(np.empty(count, np.intp), window, *numbers, smoothing=rules.smoothing)
 
-    def select(self, which: np.ndarray) -> PeakWindow:
-        """Return the windows selected by a boolean mask or by indices."""
+    def select(self, which: np.ndarray | slice) -> PeakWindow:
+        """Return the windows selected by a boolean mask, by indices or by a slice."""
         *values, smoothing = self
         return PeakWindow(*(value[which] for value in values), smoothing=smoothing)
-
-    def first(self, count: int) -> PeakWindow:
-        """Return the first ``count`` windows."""
-        *values, smoothing = self
-        return PeakWindow(*(value[:count] for value in values), smoothing=smoothing)
 
     def smooth(self) -> np.ndarray:
         """Return the windows (M, W) float32 after the low-pass."""

@@ -30,36 +30,22 @@ class _SearchRule(NamedTuple):
 
     Chosen by hand with the reasons below; tests/uwlts/stripe/test_unchanged.py keeps the results on drawn stripes. The
     least height is that of `SearchRules`.
-
-    Attributes
-    ----------
-    looks : int
-        Places examined per line: hot pixels before the stripe, and a second stripe after it.
-    most_stripes : int
-        Most stripes on one line: two sheets, each with two reflections.
-    coarse_slack : float
-        Ratio of the block contrasts of equal stripes that have different pixel phases (sigma 0.7 px).
-    clear : float
-        Contrast of a block, in least heights, that cannot be noise in single pixels.
-    rival : float
-        Contrast of a block, in least heights, that may be a second stripe. Noise reaches it on one line in a hundred,
-        and the least height on every second line.
-    spike : float
-        Least ratio of a stripe's three-pixel mean to the least height; noise may lower the mean a little.
-    bright : float
-        Least height of a bright peak, as a fraction of the saturation. A wide peak that is lower is haze.
-    minor : float
-        Largest height of an ignored stripe, as a fraction of another stripe's; it cannot be measured itself.
     """
 
-    looks: int = 4
-    most_stripes: int = 6
+    looks: int = 4  # places examined per line: hot pixels before the stripe, and a second stripe after it
+    most_stripes: int = 6  # most stripes on one line: two sheets, each with two reflections
     coarse_slack: float = 0.75
-    clear: float = 3.0
+    """Ratio of the block contrasts of equal stripes that have different pixel phases (sigma 0.7 px)."""
+    clear: float = 3.0  # contrast of a block, in least heights, that cannot be noise in single pixels
     rival: float = 1.3
+    """Contrast of a block, in least heights, that may be a second stripe. Noise reaches it on one line in a
+    hundred, and the least height on every second line."""
     spike: float = 0.85
+    """Least ratio of a stripe's three-pixel mean to the least height; noise may lower the mean a little."""
     bright: float = 0.25
+    """Least height of a bright peak, as a fraction of the saturation. A wide peak that is lower is haze."""
     minor: float = 0.5
+    """Largest height of an ignored stripe, as a fraction of another stripe's; it cannot be measured itself."""
 
 
 _RULE = _SearchRule()
@@ -97,33 +83,18 @@ def search_profiles(
 
     Under the rule `strongest`, a line with a stripe is searched again for a second stripe.
 
-    Parameters
-    ----------
-    profiles
-        Pixels (N, L) along the L lines.
-    board
-        Contrasts (L, B + 2 `MARGIN`) of the B blocks of each line, with zeros at both ends. Examined blocks are set to
-        0.
-    rules
-        Rules of the search.
+    ``profiles`` (N, L) are the pixels along the L lines. ``board`` (L, B + 2 `MARGIN`) contains the contrasts of the B
+    blocks of each line, with zeros at both ends; examined blocks are set to 0.
 
-    Returns
-    -------
-    tuple
-        Status (L,) of each line; whether a bright peak was too wide (L,); whether the line may contain more than one
-        stripe (L,); and the windows of the lines with a stripe, in their order.
+    Returns the status (L,) of each line; whether a bright peak was too wide (L,); whether the line may contain more
+    than one stripe (L,); and the windows of the lines with a stripe, in their order.
     """
     lines = profiles.shape[1]
-    peaks = _allocate_windows(lines, rules)
+    peaks = PeakWindow.empty(lines, rules)
     status = np.full(lines, _NO_STRIPE, np.uint8)
     wide, several = np.zeros((2, lines), np.bool_)
     count = _search_lines(profiles, board, *_make_buffers(peaks), rules, status, wide, several, peaks)
-    return status, wide, several, peaks.first(count)
-
-
-def _allocate_windows(count: int, rules: SearchRules) -> PeakWindow:
-    """Allocate windows for ``count`` peaks."""
-    return PeakWindow.empty(count, 2 * rules.half + rules.block, rules.smoothing)
+    return status, wide, several, peaks.select(slice(count))
 
 
 def _make_buffers(peaks: PeakWindow) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -147,33 +118,23 @@ def search_all(
     the border.
     """
     rules, most = rules._replace(order=FIRST), _RULE.most_stripes * len(lines)
-    peaks, found, clear = _allocate_windows(most, rules), np.empty(most, np.intp), np.empty(most, np.bool_)
+    peaks, found, clear = PeakWindow.empty(most, rules), np.empty(most, np.intp), np.empty(most, np.bool_)
     count = _search_all(profiles, board, lines, *_make_buffers(peaks), rules, found, clear, peaks)
     kept = np.flatnonzero(found[:count] >= 0)
     if fewest > 1:
         kept = kept[np.bincount(found[kept])[found[kept]] >= fewest]
     if not kept.size:
-        return found[:0], clear[:0], peaks.first(0)
+        return found[:0], clear[:0], peaks.select(slice(0))
     return found[kept], clear[kept], peaks.select(kept)
 
 
 def mark_rivals(
     profiles: np.ndarray, left: np.ndarray, lines: np.ndarray, known: np.ndarray, rules: SearchRules
 ) -> np.ndarray:
-    """Return a mask (M,) of the lines that have a block of high contrast left.
+    """Return a mask (M,) of the profile lines ``lines`` (M,) that have a block of high contrast left.
 
-    Parameters
-    ----------
-    profiles : (N, L)
-        Grey values of all lines.
-    left : (N, B + 2 MARGIN)
-        Contrasts of the remaining blocks of all lines; spikes are ignored.
-    lines : (M,)
-        Profile lines to examine.
-    known : (M,)
-        Lines that are marked already and not examined.
-    rules
-        Rules of the search.
+    ``left`` (L, B + 2 `MARGIN`) contains the contrasts of the remaining blocks of all lines of the profiles (N, L);
+    spikes are ignored. Lines that are ``known`` (M,) are marked already and not examined.
     """
     found = known.copy()
     _mark_rivals(profiles, left, lines, np.empty(rules.block + 2, np.float32), rules, found)

@@ -37,9 +37,7 @@ def errors_px(view, target, place, points_mm):
         return FOCAL * seen[:, :2] / seen[:, 2:] + CENTRE
 
     flat = np.column_stack([points_mm, np.zeros(len(points_mm))])
-    bias = circle_centre_bias(
-        project, flat, diameter_mm=target.diameter_mm, axis_u=(1.0, 0.0, 0.0), axis_v=(0.0, 1.0, 0.0)
-    )
+    bias = circle_centre_bias(project, flat, diameter_mm=target.diameter_mm)
     true = project_points(points_mm, RAYS, place, start=view.pixels) + bias
     return np.linalg.norm(view.pixels - true, axis=1)
 

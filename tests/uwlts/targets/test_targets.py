@@ -90,9 +90,7 @@ def photograph(levels, *, noise=0.0, seed=0):
 
 def errors_px(view, camera):
     """Return detected minus true image of each circle's centre, with the perspective bias removed, (N, 2)."""
-    bias = circle_centre_bias(
-        camera.project, view.points_mm, diameter_mm=PLATE.diameter_mm, axis_u=(1, 0, 0), axis_v=(0, 1, 0)
-    )
+    bias = circle_centre_bias(camera.project, view.points_mm, diameter_mm=PLATE.diameter_mm)
     return view.pixels - bias - camera.project(view.points_mm)
 
 

@@ -18,7 +18,7 @@ from twin.design.report.study_tables import number_text
 from twin.design.sensor_arrays import SensorArrays, extract_parameters
 from uwlts.model.placement import laser_pose
 from uwlts.model.sensor import Camera, Medium, Sensor, Window
-from uwlts.optics.design import Lens, WindowGeometry, standoff_mm, trace_rays, undistort_pixels
+from uwlts.optics.design import WindowGeometry, standoff_mm, trace_pixels, trace_rays
 from uwlts.pages.toolkit import BLUE, INK, RED, SOFT, new_figure
 
 _BEYOND = 1.06  # length of drawn rays and sheet relative to the distance of the volume's far end
@@ -94,7 +94,7 @@ def make_view(sensor: Sensor, medium: Medium) -> SideView:
     sideways = math.hypot(*pose.normal[:2])
     across = pose.normal[:2] / sideways * (-1 if pose.normal[:2] @ pose.origin_mm[:2] < 0 else 1)
     side_axes = np.array([[*across, 0.0], ahead])
-    border = undistort_pixels(Lens.from_description(camera), _border_towards(camera, across))
+    border = trace_pixels(camera, _border_towards(camera, across))
     return SideView(
         camera=_project(pupil, ahead, camera.window, windows[0], side_axes),
         laser=_project(pose.origin_mm, pose.axis, sensor.laser.window, windows[1], side_axes),

@@ -39,24 +39,19 @@ class MotionFault(str):
 class TargetQuality:
     """Quality of an image of the target; ``reasons`` for rejection are empty for a good image.
 
-    ``points`` is the number of points found, ``share`` their fraction of the target's points, ``blur_px`` the Gaussian
-    blur of the edges. ``contrast`` is relative to full scale, ``saturated`` is the fraction of the target's pixels.
+    ``points`` is the number of points found, ``blur_px`` the Gaussian blur of the edges.
     """
 
     points: int
-    share: float
     blur_px: float
-    contrast: float
-    saturated: float
     reasons: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class StripeQuality:
-    """Quality of a laser image: stripe pixels (N, 2) on the target, fraction of saturated lines, and reasons."""
+    """Quality of a laser image: stripe pixels (N, 2) on the target, and reasons for rejection."""
 
     pixels: np.ndarray
-    saturated: float
     reasons: tuple[str, ...]
 
     @property
@@ -68,7 +63,6 @@ class StripeQuality:
 def judge_target(image: np.ndarray, view: TargetView, target: Target, *, full_dn: int) -> TargetQuality:
     """Assess an image (H, W) in which the points of ``view`` were found; ``full_dn`` is the value of saturation."""
     count, of_all = len(view.pixels), len(target.indices)
-    share = count / of_all
     blur = edge_blur_px(image, view.pixels, half_px=_spacing_px(view, target) / 2)
     contrast = float(np.median(view.quality["contrast"])) / full_dn
     covered = np.zeros(image.shape, np.uint8)
@@ -76,7 +70,7 @@ def judge_target(image: np.ndarray, view: TargetView, target: Target, *, full_dn
     saturated = float(np.mean(image[covered > 0] >= full_dn))
     reasons = {
         f"partial: {count} of {of_all} points found; bring more of the target into the image": (
-            count < min(_FEWEST_POINTS, of_all) or share < _SMALLEST_SHARE
+            count < min(_FEWEST_POINTS, of_all) or count < _SMALLEST_SHARE * of_all
         ),
         f"blurred: edges are {blur:.1f} px wide, at most {_LARGEST_BLUR_PX:g} are allowed; focus, or change the "
         "distance": blur > _LARGEST_BLUR_PX,
@@ -89,8 +83,7 @@ def judge_target(image: np.ndarray, view: TargetView, target: Target, *, full_dn
             f"{100 * _LARGEST_SATURATED:.0f} % are allowed; use less light or a shorter lamp_ms"
         ): saturated > _LARGEST_SATURATED,
     }
-    refused = tuple(reason for reason, applies in reasons.items() if applies)
-    return TargetQuality(count, share, blur, contrast, saturated, refused)
+    return TargetQuality(count, blur, tuple(reason for reason, applies in reasons.items() if applies))
 
 
 def edge_blur_px(image: np.ndarray, pixels: np.ndarray, *, half_px: float) -> float:
@@ -163,7 +156,7 @@ def judge_stripe(
     try:
         stripe = extract_stripe(image, stripe_along=stripe_along, saturation=full_dn)
     except ImageError as error:
-        return StripeQuality(np.empty((0, 2)), 0.0, (str(error),))
+        return StripeQuality(np.empty((0, 2)), (str(error),))
     found, pixels = stripe.status == StripeStatus.OK, stripe.pixels()
     outline = _hull(view.pixels, margin_px=_spacing_px(view, target)).astype(np.float32)
     on_target = [cv2.pointPolygonTest(outline, (float(u), float(v)), False) >= 0 for u, v in pixels]
@@ -174,7 +167,7 @@ def judge_stripe(
     if lit >= FEWEST_TARGET_LINES and saturated > 0.05:
         share = f"{100 * saturated:.0f} % of its lines, at most 5 % are allowed"
         reasons = (LaserFault(f"stripe saturated on {share}; shorten laser_ms"),)
-    return StripeQuality(pixels[np.array(on_target, dtype=bool)], saturated, reasons)
+    return StripeQuality(pixels[np.array(on_target, dtype=bool)], reasons)
 
 
 def _hull(pixels: np.ndarray, *, margin_px: float = 0.0) -> np.ndarray:

@@ -173,22 +173,15 @@ def calibrate_lens(
 ) -> LensCalibration:
     """Calibrate a lens from images of a flat target.
 
-    Parameters
-    ----------
-    images, width_px, height_px, poses, approaching, circle_diameter_mm
-        As for `solve_camera`.
-    choice
-        Parameters to estimate. If the stage's direction is wrongly assumed to be the target's normal, this has the same
-        effect as another lens. With the poses "stage-normal", "auto" therefore is k1 and k2; with both stage poses,
-        pixels are square. Wide lenses, with points more than `WIDE_DEG` from the axis, usually have k1 k2 k4 k5: a
-        rational function follows the arctangent, which a polynomial cannot.
-    progress
-        Called with the number of models tried and the total.
+    ``choice`` states the parameters to estimate. If the stage's direction is wrongly assumed to be the target's normal,
+    this has the same effect as another lens. With the poses "stage-normal", "auto" therefore is k1 and k2; with both
+    stage poses, pixels are square. Wide lenses, with points more than `WIDE_DEG` from the axis, usually have k1 k2 k4
+    k5: a rational function follows the arctangent, which a polynomial cannot.
 
-    Raises
-    ------
-    CalibrationError
-        The images determine no model, or contradict each other.
+    ``progress`` is called with the number of models tried and the total; the other parameters are those of
+    `solve_camera`.
+
+    Raises CalibrationError if the images determine no model, or contradict each other.
     """
 
     solve_centres = partial(solve_camera, width_px=width_px, height_px=height_px, poses=poses, approaching=approaching)
@@ -202,14 +195,26 @@ def calibrate_lens(
         usual = replace(usual, distortion=_WIDE_USUAL)
         plain = solve(images, options=usual)
 
-    def inliers(options: CameraOptions, plain: CameraSolution) -> list[np.ndarray]:
-        """Return masks (N,) of the points near their predicted positions, from a robust fit near a plain one."""
-        robust = solve(images, start=plain, options=replace(options, soft_limit_px=_SOFT * _scatter(plain)))
-        return _inliers(robust)
+    def find_inliers(options: CameraOptions, plain: CameraSolution) -> dict[int, np.ndarray]:
+        """Return masks (N,) of the points near their predicted positions, from a robust fit near a plain one.
 
+        They are within five robust standard deviations, which are at least `_FINEST_PX`. Images with too many other
+        points are left out.
+        """
+        robust = solve(images, start=plain, options=replace(options, soft_limit_px=_SOFT * _scatter(plain)))
+        limit = DEFAULT_K * max(_scatter(robust), _FINEST_PX)
+        misses = [np.linalg.norm(residuals, axis=1) for residuals in robust.residuals_px]
+        shares.update(enumerate(float(np.mean(each <= limit)) for each in misses))
+        return {n: each <= limit for n, each in enumerate(misses) if shares[n] >= 1 - _LARGEST_REJECTED}
+
+    def clean(keep: dict[int, np.ndarray]) -> dict[int, TargetImage]:
+        parts = ((n, images[n], inside) for n, inside in keep.items())
+        return {n: replace(i, points_mm=i.points_mm[inside], pixels=i.pixels[inside]) for n, i, inside in parts}
+
+    shares: dict[int, float] = {}
     candidates: list[LensCandidate] = []
-    options, keep = usual, inliers(usual, plain)
-    good = [_remove_outliers(i, inside) for i, inside in zip(images, keep, strict=True) if _has_enough_inliers(inside)]
+    options, keep = usual, find_inliers(usual, plain)
+    good = [*clean(keep).values()]
     if len(tried) > 1 and len(good) > _FEWEST_IMAGES:
         centred = _correct_circles(good, solve(good, options=usual))
         squares: dict[CameraOptions, np.ndarray] = {}
@@ -222,14 +227,13 @@ def calibrate_lens(
             if choice.distortion != "auto" or ("k3" not in options.distortion and not wide):
                 break
     if options != usual:
-        keep = inliers(options, solve(images, options=options))
+        keep = find_inliers(options, solve(images, options=options))
     left_out = {
-        number: f"{100 * (1 - inside.mean()):.0f} % of its points are not where the other images predict them"
-        for number, inside in enumerate(keep)
-        if not _has_enough_inliers(inside)
+        number: f"{100 * (1 - share):.0f} % of its points are not where the other images predict them"
+        for number, share in shares.items()
+        if number not in keep
     }
-    used = [number for number in range(len(images)) if number not in left_out]
-    cleaned = {number: _remove_outliers(images[number], keep[number]) for number in used}
+    used, cleaned = [*keep], clean(keep)
     full = options
     if (
         choice.distortion == "auto"
@@ -310,25 +314,10 @@ def _scatter(solution: CameraSolution) -> float:
     return float(np.median(np.linalg.norm(np.vstack(solution.residuals_px), axis=1))) / 1.1774
 
 
-def _inliers(solution: CameraSolution) -> list[np.ndarray]:
-    """Return masks (N,) of points within five robust standard deviations, which are at least `_FINEST_PX`."""
-    limit = DEFAULT_K * max(_scatter(solution), _FINEST_PX)
-    return [np.linalg.norm(residuals, axis=1) <= limit for residuals in solution.residuals_px]
-
-
 def _expected_std(solution: CameraSolution) -> np.ndarray:
     """Return the standard deviations (P,) of the parameters, for points that scatter by at least `_FINEST_PX`."""
     larger = max(_FINEST_PX / max(solution.sigma_px, _LEAST_SCATTER_PX), 1.0)
     return larger * np.sqrt(np.diag(solution.covariance))
-
-
-def _has_enough_inliers(inside: np.ndarray) -> bool:
-    """Return whether enough points (N,) of an image are inliers."""
-    return bool(inside.mean() >= 1 - _LARGEST_REJECTED)
-
-
-def _remove_outliers(image: TargetImage, keep: np.ndarray) -> TargetImage:
-    return replace(image, points_mm=image.points_mm[keep], pixels=image.pixels[keep])
 
 
 def _correct_circles(images: Sequence[TargetImage], solution: CameraSolution) -> list[TargetImage]:

@@ -25,6 +25,8 @@ from uwlts.model.calibration import CameraModel
 from uwlts.optics.camera import project
 from uwlts.targets.detection.ellipses import circle_centre_bias
 
+Poses = Literal["stage-normal", "stage", "free"]
+
 # Coordinates are normalised: a direction with an extent of the points below this fraction of the largest one, or
 # a null vector separated from others by less than this, cannot be distinguished from rounding and lens distortion.
 _FLAT = 1e-4
@@ -86,35 +88,30 @@ def _normalise(coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return similarity, np.column_stack([coordinates, np.ones(len(coordinates))]) @ similarity.T
 
 
-def _linear_start(views: list[Placement], intrinsics: Intrinsics) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Estimate camera parameters (P,) and poses (6,) of a target that the stage moves along its normal.
+def _find_start(views: list[Placement], intrinsics: Intrinsics, poses: Poses) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Estimate camera parameters (P,) and poses (6,).
 
-    The placement with the largest motion gives both by the linear method; the poses of the others follow.
+    If the stage moves the target along its normal, the placement with the largest motion gives both by the linear
+    method. From single images, f follows from homographies and the principal point is the centre (see
+    `cv2.initCameraMatrix2D`, after Zhang, A flexible new technique for camera calibration, PAMI 2000).
     """
-    farthest = int(np.argmax([np.ptp(view.shifts_mm) for view in views]))
-    matrix, rotation, translation = direct_linear(views[farthest].displace(), views[farthest].pixels)
-    global_values = intrinsics.from_matrix(matrix)
-    poses = [placement_pose(view, intrinsics.matrix(global_values)) for view in views]
-    poses[farthest] = np.r_[cv2.Rodrigues(rotation)[0].ravel(), translation]
-    return global_values, poses
-
-
-def _planar_start(views: list[Placement], intrinsics: Intrinsics) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Estimate camera parameters (P,) and poses (6,) of single images, with f from homographies.
-
-    The principal point is the centre. See `cv2.initCameraMatrix2D`, after Zhang, A flexible new technique for camera
-    calibration, PAMI 2000.
-    """
-    size = (intrinsics.width_px, intrinsics.height_px)
-    points, pixels = ([getattr(v, name).astype(np.float32) for v in views] for name in ("points_mm", "pixels"))
-    matrix = cv2.initCameraMatrix2D(points, pixels, size, 1.0)
-    if not (np.isfinite(matrix).all() and 0.1 < matrix[0, 0] / max(size) < 100):
-        raise CalibrationError(
-            "the target images do not determine the focal length: tilt the target differently relative to the camera's "
-            "axis in each image"
-        )
-    global_values = intrinsics.from_matrix(matrix)
-    return global_values, [placement_pose(view, intrinsics.matrix(global_values)) for view in views]
+    known = {}
+    if poses == "free":
+        size = (intrinsics.width_px, intrinsics.height_px)
+        points, pixels = ([getattr(v, name).astype(np.float32) for v in views] for name in ("points_mm", "pixels"))
+        matrix = cv2.initCameraMatrix2D(points, pixels, size, 1.0)
+        if not (np.isfinite(matrix).all() and 0.1 < matrix[0, 0] / max(size) < 100):
+            raise CalibrationError(
+                "the target images do not determine the focal length: tilt the target differently relative to the "
+                "camera's axis in each image"
+            )
+    else:
+        farthest = int(np.argmax([np.ptp(view.shifts_mm) for view in views]))
+        matrix, rotation, translation = direct_linear(views[farthest].displace(), views[farthest].pixels)
+        known[farthest] = np.r_[cv2.Rodrigues(rotation)[0].ravel(), translation]
+    values = intrinsics.from_matrix(matrix)
+    matrix = intrinsics.matrix(values)
+    return values, [known[n] if n in known else placement_pose(view, matrix) for n, view in enumerate(views)]
 
 
 def placement_pose(placement: Placement, matrix: np.ndarray) -> np.ndarray:
@@ -125,8 +122,6 @@ def placement_pose(placement: Placement, matrix: np.ndarray) -> np.ndarray:
     return np.r_[rotation.ravel(), translation.ravel()]
 
 
-Poses = Literal["stage-normal", "stage", "free"]
-
 # Largest standard deviations relative to f and to the image's side: lengths would have the same relative errors.
 _LARGEST_FOCAL_STD = 0.02
 _LARGEST_CENTRE_STD = 0.05
@@ -134,7 +129,6 @@ _LARGEST_CENTRE_STD = 0.05
 # wrong.
 _SETTLED_PX = 1e-4
 _BIAS_ROUNDS = 10
-_X, _Y = np.eye(3)[:2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,13 +169,10 @@ class CameraSolution:
         """Return the root mean square distance between detected and calculated pixels over all images."""
         return float(np.sqrt(np.mean(np.sum(np.vstack(self.residuals_px) ** 2, axis=1))))
 
-    def largest_bias_px(self) -> float | None:
-        """Return the largest corrected offset over all circles."""
-        return None if self.bias_px is None else float(np.max(np.linalg.norm(np.vstack(self.bias_px), axis=1)))
-
     def figures(self) -> dict[str, JsonValue]:
         """Return residuals, standard deviations and covariance for files; None for missing values."""
         direction, tilt, tilt_std = self.stage_direction, self.stage_tilt_rad, self.stage_tilt_std_rad
+        bias_px = None if self.bias_px is None else np.linalg.norm(np.vstack(self.bias_px), axis=1)
         return {
             "images": len(self.residuals_px),
             "points": sum(map(len, self.residuals_px)),
@@ -194,7 +185,7 @@ class CameraSolution:
             "stage_direction": None if direction is None else direction.tolist(),
             "stage_tilt_deg": None if tilt is None else float(np.degrees(tilt)),
             "stage_tilt_std_deg": None if tilt_std is None else float(np.degrees(tilt_std)),
-            "largest_circle_bias_px": self.largest_bias_px(),
+            "largest_circle_bias_px": None if bias_px is None else float(bias_px.max()),
             "rounds": self.rounds,
             "stopped": self.stopped,
         }
@@ -216,33 +207,18 @@ def solve_camera(
     The stage moves the sensor by s along d, so the target moves by -s d relative to the sensor. A point x of the target
     is at R (x - (s - s0) d) + t in the camera frame, with d in the target's frame.
 
-    Parameters
-    ----------
-    images
-        Target points in each image.
-    width_px, height_px
-        Size of the images.
-    poses : {"stage-normal", "stage", "free"}
-        "stage-normal" (the thesis): one pose per placement of the target, d is the target's normal. "stage": d is
-        estimated too, for each placement; this needs pixels of known shape. "free": one pose per image, stage positions
-        are not used.
-    approaching
-        Whether increasing stage positions move the sensor towards the target; unused for "free".
-    options
-        Parameters to estimate.
-    start
-        Solution for nearly the same pixels, with the same options and poses.
-    circle_diameter_mm
-        The pixels are centres of images of circles with this diameter. Their offsets from the images of the circles'
-        centres are corrected iteratively.
+    With the ``poses`` "stage-normal" (the thesis) there is one pose per placement of the target, and d is the target's
+    normal. "stage": d is estimated too, for each placement; this needs pixels of known shape. "free": one pose per
+    image, stage positions are not used. ``approaching`` states whether increasing stage positions move the sensor
+    towards the target; it is unused for "free".
 
-    Raises
-    ------
-    CalibrationError
-        There are too few images, the stage did not move, or the target is mirrored relative to the stage. The
-        parameters are not determined, or the offsets do not converge.
-    RangeError
-        A circle's image is not an ellipse.
+    ``start`` is a solution for nearly the same pixels, with the same options and poses. If the pixels are centres of
+    images of circles with ``circle_diameter_mm``, their offsets from the images of the circles' centres are corrected
+    iteratively.
+
+    Raises CalibrationError if there are too few images, the stage did not move, or the target is mirrored relative to
+    the stage. The same if the parameters are not determined, or the offsets do not converge; RangeError if a circle's
+    image is not an ellipse.
     """
     options = CameraOptions() if options is None else options
     intrinsics = Intrinsics(options, width_px=width_px, height_px=height_px)
@@ -252,8 +228,7 @@ def solve_camera(
         if start is not None:
             global_values, local = intrinsics.from_model(start.model), [_restart(view, start, poses) for view in views]
         else:
-            found = _planar_start if poses == "free" else _linear_start
-            global_values, local = found(views, intrinsics)
+            global_values, local = _find_start(views, intrinsics, poses)
             local = [np.r_[pose, 0.0, 0.0] if poses == "stage" else pose for pose in local]
 
         def model(group: int, global_values: np.ndarray, local: np.ndarray) -> Observation | None:
@@ -303,11 +278,9 @@ def centre_offsets(
 
     Raises RangeError if a circle's image is not an ellipse.
     """
-
-    def project_target(points: np.ndarray) -> np.ndarray:
-        return project(points @ pose[:3, :3].T + pose[:3, 3])
-
-    return circle_centre_bias(project_target, points_mm, diameter_mm=diameter_mm, axis_u=_X, axis_v=_Y)
+    return circle_centre_bias(
+        lambda points: project(points @ pose[:3, :3].T + pose[:3, 3]), points_mm, diameter_mm=diameter_mm
+    )
 
 
 def _group_views(

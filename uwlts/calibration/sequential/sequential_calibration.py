@@ -184,11 +184,10 @@ def gather(
     )
 
 
-def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolution | None = None) -> CalibrationResult:
-    """Calibrate from gathered evidence, optionally near ``start``; errors as `calibrate_sequentially`."""
+def solve(evidence: Evidence, *, options: CalibrationOptions) -> CalibrationResult:
+    """Calibrate from gathered evidence; errors as `calibrate_sequentially`."""
     sensor = evidence.sensor
-    seen = _calibrate_camera(evidence, options, start)
-    camera, found = seen.camera, seen.air
+    camera, lens, found, doubts = _calibrate_camera(evidence, options)
     if found.no_stripe:
         raise CalibrationError(found.no_stripe)
     stripe_points = points_on_target(camera.model, found.stripes, camera.target_poses, plate_mm=found.target.plate_mm)
@@ -197,7 +196,7 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
         stripe_points.points_mm, nominal_normal=pose.normal, nominal_offset_mm=float(pose.normal @ pose.origin_mm)
     )
     figures, apart = {"camera": camera.figures()}, None
-    warnings = [*evidence.warnings, *seen.warnings]
+    warnings = [*evidence.warnings, *doubts]
     rays = stripe_points.points_mm[:, :2] / stripe_points.points_mm[:, 2:]
     of_image = [stripe_points.image == number for number in range(len(found.stripes))]
     warnings += doubt_sheet_at_rest(
@@ -207,10 +206,10 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
         across=1 if sensor.camera.stripe_along == "width" else 0,
         unit="mm",
     )
-    if seen.lens is not None:
-        sheet, apart = _add_image_uncertainty(sheet, seen.lens, found), _angle_between_halves(sheet, seen.lens, found)
-        figures["camera"] |= _lens_figures(seen.lens, found)
-        warnings += seen.lens.half_doubts()
+    if lens is not None:
+        sheet, apart = _add_image_uncertainty(sheet, lens, found), _angle_between_halves(sheet, lens, found)
+        figures["camera"] |= _lens_figures(lens, found)
+        warnings += lens.half_doubts()
         if apart is not None:
             words = f"their sheets differ by {np.degrees(apart):.3f} deg"
             warnings += half_doubt(words, apart=apart, std=sheet.normal_std_rad)
@@ -262,18 +261,13 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
     return CalibrationResult(calibration, found, camera, stripe_points, sheet, used, window, warnings)
 
 
-@dataclass(frozen=True, eq=False)
-class _CameraResult:
-    """Camera, selected lens or None, used images, and warnings."""
+def _calibrate_camera(
+    evidence: Evidence, options: CalibrationOptions
+) -> tuple[CameraSolution, LensCalibration | None, AirEvidence, list[str]]:
+    """Calibrate the camera from the images of the target, with lens selection if that is wanted.
 
-    camera: CameraSolution
-    lens: LensCalibration | None
-    air: AirEvidence
-    warnings: list[str]
-
-
-def _calibrate_camera(evidence: Evidence, options: CalibrationOptions, start: CameraSolution | None) -> _CameraResult:
-    """Calibrate the camera from the images of the target, near ``start`` if given, or with lens selection."""
+    Return the camera, the selected lens or None, the used images, and warnings.
+    """
     air = evidence.air
     width_px, height_px = evidence.sensor.camera.width_px, evidence.sensor.camera.height_px
     approaching = evidence.approaching is not False
@@ -284,7 +278,7 @@ def _calibrate_camera(evidence: Evidence, options: CalibrationOptions, start: Ca
 
     def size_doubts(images: Sequence[TargetImage], estimated: CameraOptions) -> list[str]:
         # Refraction in the focal length would change with distance.
-        if start is not None or options.poses == "free" or evidence.medium_kind != "air":
+        if options.poses == "free" or evidence.medium_kind != "air":
             return []
         with suppress(CalibrationError):
             free = solved(images, poses="free", options=estimated)
@@ -293,8 +287,8 @@ def _calibrate_camera(evidence: Evidence, options: CalibrationOptions, start: Ca
 
     if options.lens is None:
         estimated = options.camera.with_described_pixels(evidence.sensor.camera)
-        camera = solved(air.images, poses=options.poses, options=estimated, start=start)
-        return _CameraResult(camera, None, air, size_doubts(air.images, estimated))
+        camera = solved(air.images, poses=options.poses, options=estimated)
+        return camera, None, air, size_doubts(air.images, estimated)
     lens = calibrate_lens(
         air.images,
         width_px=width_px,
@@ -308,19 +302,15 @@ def _calibrate_camera(evidence: Evidence, options: CalibrationOptions, start: Ca
         ),
         circle_diameter_mm=diameter_mm,
     )
-    camera, used, names = (
-        replace(lens.solution, covariance=lens.covariance),
-        air.only(lens.used, lens.images),
-        air.names(),
-    )
-    warnings = [f"{names[place]}: left out, {reason}" for place, reason in lens.left_out.items()]
+    camera, used = replace(lens.solution, covariance=lens.covariance), air.only(lens.used, lens.images)
+    warnings = [f"{air.names()[place]}: left out, {reason}" for place, reason in lens.left_out.items()]
     warnings += size_doubts(used.images, lens.options)
     if options.poses == "stage-normal" and lens.options.pixel_aspect is not None:
         freer = solved(used.images, poses="stage", options=lens.options)
         if freer.stage_tilt_rad is not None and freer.sigma_px <= _CLEARLY_LESS * camera.sigma_px:
             unsquare = solved(used.images, poses=options.poses, options=replace(lens.options, pixel_aspect=None))
             warnings.append(_describe_stage_tilt(camera, freer, unsquare, tilt_rad=freer.stage_tilt_rad))
-    return _CameraResult(camera, lens, used, warnings)
+    return camera, lens, used, warnings
 
 
 def _lens_figures(lens: LensCalibration, found: AirEvidence) -> dict[str, JsonValue]:

@@ -131,9 +131,7 @@ def label_steps(
         seen = [image for image in labelled if image is not None]
         if seen:
             turn, standard = _estimate_turn(calibration, window, seen, uncertainty), seen[0].standard
-            stated = standard.height_uncertainty_mm
-            std_mm = stated / 2 if stated else uncertainty.step_height_mm
-            if doubt := turn.doubt(height_mm=standard.height_mm, std_mm=std_mm):
+            if doubt := turn.doubt(height_mm=standard.height_mm, std_mm=seen[0].height_std_mm(uncertainty)):
                 warnings.append(f"{capture}: {doubt}")
             factor, std = turn.compute_lengthening()
             labelled = [

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import pkgutil
-from collections.abc import Callable
 from functools import lru_cache
 from importlib import import_module
 
@@ -28,23 +27,20 @@ def method_names() -> tuple[str, ...]:
 
 
 def place_centre(method: str, peak: PeakWindow) -> tuple[np.ndarray, np.ndarray]:
-    """Return the centre (M,) float32 of each peak, px from its window's first pixel, and its amplitude."""
+    """Return the centre (M,) float32 of each peak, px from its window's first pixel, and its amplitude.
+
+    The amplitude is the height of the best-fitting Gaussian at the centre, grey levels.
+    """
     if not peak.start.size:
         return np.empty(0, np.float32), np.empty(0, np.float32)
-    centre = _method(method)(peak)
-    return centre, amplitudes(peak, centre)
-
-
-def amplitudes(peak: PeakWindow, centre: np.ndarray) -> np.ndarray:
-    """Return the height (M,) float32, grey levels, of the best-fitting Gaussian at each centre (M,)."""
-    result = np.empty(centre.size, np.float32)
-    _best_heights(peak, centre, result)
-    return result
+    centre = import_module(f"{__name__}.{method.replace('-', '_')}").centres(peak)
+    heights = np.empty(centre.size, np.float32)
+    _best_heights(peak, centre, heights)
+    return centre, heights
 
 
 @compiled
 def _best_heights(peak: PeakWindow, centre: np.ndarray, result: np.ndarray) -> None:
-    """Compute the heights (M,); see `amplitudes`."""
     size = peak.window.shape[1]
     for m in range(centre.size):
         pixels, ground, middle = peak.window[m], peak.base[m], centre[m]
@@ -67,8 +63,3 @@ def _best_heights(peak: PeakWindow, centre: np.ndarray, result: np.ndarray) -> N
         # Sum over the product of two Gaussians, solved for the height of the first.
         joint = np.float32(0.5 / math.pi) * (np.float32(1.0) / (sigma * sigma) + sharpness)
         result[m] = total * math.sqrt(joint)
-
-
-@lru_cache
-def _method(name: str) -> Callable[[PeakWindow], np.ndarray]:
-    return import_module(f"{__name__}.{name.replace('-', '_')}").centres

@@ -86,23 +86,11 @@ def estimate_noise(image):
     The lower fifth of its responses is used instead of their mean, because a fine pattern has edges in most
     neighbourhoods.
     """
-    counts = np.zeros(8 * np.iinfo(image.dtype).max + 1, np.int64)
-    _count_responses(image, counts)
+    # One row in four is sufficient for a quantile.
+    across = image[:-2:4].astype(np.int32) - 2 * image[1:-1:4].astype(np.int32) + image[2::4]
+    counts = np.bincount(np.abs(np.diff(across, 2, axis=1)).ravel())
     lower_part = np.searchsorted(np.cumsum(counts), _Rule.smooth_share * counts.sum())
     return float(lower_part) / (6 * NormalDist().inv_cdf(0.5 + _Rule.smooth_share / 2))
-
-
-@compiled
-def _count_responses(image, counts):
-    """Count the responses of the mask by size. One row in four is sufficient for a quantile."""
-    for v in range(0, image.shape[0] - 2, 4):
-        above, middle, below = image[v], image[v + 1], image[v + 2]
-        before = np.int64(above[0]) - 2 * np.int64(middle[0]) + np.int64(below[0])
-        here = np.int64(above[1]) - 2 * np.int64(middle[1]) + np.int64(below[1])
-        for u in range(2, image.shape[1]):
-            after = np.int64(above[u]) - 2 * np.int64(middle[u]) + np.int64(below[u])
-            counts[abs(before - 2 * here + after)] += 1
-            before, here = here, after
 
 
 def find_blobs(image, noise):
@@ -259,59 +247,44 @@ def _select_ellipses(mask, *, bright, fewest=0):
     # The outline of the largest circle in the image is shorter than four times its shorter side.
     chosen = np.flatnonzero((lengths >= 8) & (lengths <= 4 * min(height, width)))
     chosen = chosen[hierarchy[0, chosen, 3] < 0] if len(contours) else chosen
-    chosen = chosen[: len(chosen) if len(chosen) >= fewest else 0]
-    found = np.empty((len(chosen), 7))
-    if len(chosen):
-        ends = np.cumsum(lengths[chosen])
-        _outline_moments(np.concatenate([contours[k] for k in chosen])[:, 0], ends, width, height, found)
+    if len(chosen) < max(fewest, 1):
+        return Blobs(np.empty((0, 2)), np.empty((0, 2, 2)), bright)
+    points = np.concatenate([contours[k] for k in chosen])[:, 0]
+    first = np.cumsum(lengths[chosen]) - lengths[chosen]
+    area, centres, covariances = _outline_moments(points, first)
+    inside = np.logical_and.reduceat(((points > 1) & (points < (width - 2, height - 2))).all(1), first)
     # The outline passes through pixel centres: it excludes half a pixel all around, and lines of pixels completely.
-    found = found[(found[:, 1] > 0) & (found[:, 1] + found[:, 0] / 2 >= _Rule.least_area_px)]
-    area, covariances = found[:, 1], found[:, 4:] / found[:, 1:2]
-    determinant = covariances[:, 0] * covariances[:, 2] - covariances[:, 1] ** 2
+    inside &= (area > 0) & (area + lengths[chosen] / 2 >= _Rule.least_area_px)
+    area, covariances = area[inside], covariances[inside]
     # The uniform disc of radius r has the variance r^2 / 4, so an ellipse has area 4 pi sqrt(det covariance).
+    determinant = covariances[:, 0] * covariances[:, 3] - covariances[:, 1] ** 2
     expected = 4 * np.pi * np.sqrt(np.maximum(determinant, 0))
     like = np.abs(area - expected) <= _Rule.ellipse_departure * expected
-    centres, shapes = found[like, 2:4] / area[like, None], covariances[like][:, [0, 1, 1, 2]]
-    values, vectors = np.linalg.eigh(shapes.reshape(-1, 2, 2))
+    values, vectors = np.linalg.eigh(covariances[like].reshape(-1, 2, 2))
     semi_axes = 2 * np.sqrt(values) + 0.5
-    return Blobs(centres, (vectors * semi_axes[:, None, :]) @ vectors.swapaxes(1, 2), bright)
+    return Blobs(centres[inside][like], (vectors * semi_axes[:, None, :]) @ vectors.swapaxes(1, 2), bright)
 
 
-@compiled
-def _outline_moments(points, ends, width, height, found):
-    """Compute number of points, area, first moments and central second moments (K, 7) of polygons, by Green's theorem.
+def _outline_moments(points, first):
+    """Return areas (K,), centroids (K, 2) and covariances xx, xy, yx, yy (K, 4) of polygons, by Green's theorem.
 
-    ``points`` (N, 2) contains the polygons one after another, up to the indices ``ends`` (K,). The area is 0 for
-    polygons at the border of the image.
+    ``points`` (N, 2) contains the polygons one after another, from the indices ``first`` (K,) on. Lines have area 0.
     """
-    first = 0
-    for number in range(ends.size):
-        end, inside = ends[number], True
-        # Coordinates relative to the first point reduce rounding errors.
-        u0, v0 = points[first, 0], points[first, 1]
-        area, mu, mv, uu, uv, vv = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        before_u, before_v = float(points[end - 1, 0] - u0), float(points[end - 1, 1] - v0)
-        for k in range(first, end):
-            inside &= 1 < points[k, 0] < width - 2 and 1 < points[k, 1] < height - 2
-            u, v = float(points[k, 0] - u0), float(points[k, 1] - v0)
-            cross = before_u * v - u * before_v
-            area += cross
-            mu += cross * (before_u + u)
-            mv += cross * (before_v + v)
-            uu += cross * (before_u * (before_u + u) + u * u)
-            vv += cross * (before_v * (before_v + v) + v * v)
-            uv += cross * (before_u * (2.0 * before_v + v) + u * (before_v + 2.0 * v))
-            before_u, before_v = u, v
-        sign = 1.0 if area > 0.0 else -1.0
-        area, mu, mv = sign * area / 2.0, sign * mu / 6.0, sign * mv / 6.0
-        result = found[number]
-        result[0], result[1] = end - first, area if inside else 0.0
-        result[2], result[3] = mu + area * u0, mv + area * v0
-        if area > 0.0:
-            result[4] = sign * uu / 12.0 - mu * mu / area
-            result[5] = sign * uv / 24.0 - mu * mv / area
-            result[6] = sign * vv / 12.0 - mv * mv / area
-        first = end
+    # Coordinates relative to the first point: all sums are integers, and exact.
+    counts = np.diff(first, append=len(points))
+    u, v = (points - np.repeat(points[first], counts, axis=0)).T.astype(float)
+    before = np.arange(len(points)) - 1
+    before[first] += counts
+    p, q = u[before], v[before]
+    squares = p * (p + u) + u * u, p * (2 * q + v) + u * (q + 2 * v), q * (q + v) + v * v
+    sums = np.add.reduceat(np.stack([np.ones(len(u)), p + u, q + v, *squares]) * (p * v - u * q), first, axis=1)
+    area, mu, mv, uu, uv, vv = (
+        sums * np.where(sums[0] > 0, 1.0, -1.0) / np.array([2.0, 6.0, 6.0, 12.0, 24.0, 12.0])[:, None]
+    )
+    unit = np.where(area > 0, area, 1.0)
+    xy = uv - mu * mv / unit
+    covariances = np.stack([uu - mu * mu / unit, xy, xy, vv - mv * mv / unit], axis=1) / unit[:, None]
+    return area, points[first] + np.stack([mu / unit, mv / unit], axis=1), covariances
 
 
 def _largest_family(radii, ratio):

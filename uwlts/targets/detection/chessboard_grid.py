@@ -4,6 +4,7 @@ from itertools import product
 
 import cv2
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from uwlts.targets.detection.blobs import check_grey
 from uwlts.targets.detection.lattice import select_agreeing
@@ -225,11 +226,7 @@ def _steps(grid: np.ndarray, axis: int) -> np.ndarray:
 
 def sample_levels(grey: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Return grey levels (N,) interpolated at places (N, 2); outside the image those of its border."""
-    x, y = np.clip(places, 0.0, np.array(grey.shape[::-1]) - 1.0).T
-    column, row = (np.minimum(each.astype(int), size - 2) for each, size in ((x, grey.shape[1]), (y, grey.shape[0])))
-    dx, dy = x - column, y - row
-    upper = grey[row, column] * (1 - dx) + grey[row, column + 1] * dx
-    return upper * (1 - dy) + (grey[row + 1, column] * (1 - dx) + grey[row + 1, column + 1] * dx) * dy
+    return map_coordinates(grey, places.T[::-1], output=float, order=1, mode="nearest")
 
 
 HALF_WINDOW = 5  # half side of the window for a corner's quality, px

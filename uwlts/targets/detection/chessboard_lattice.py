@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from uwlts.targets.detection.chessboard_grid import count_corners, has_more_corners, remove_doubtful, sample_levels
-from uwlts.targets.detection.lattice import LATTICE_RULE, STEPS, local_steps
+from uwlts.targets.detection.lattice import grow_lattice
 
 
 class _Rule:
@@ -104,40 +104,7 @@ class _Corners:
             if abs(turn) > _Rule.seed_sine * np.linalg.norm(first) * np.linalg.norm(second):
                 yield corner, np.stack([first, second] if turn > 0 else [second, first])
 
-    def grow(self, seed: int, steps: np.ndarray, tree: KDTree) -> dict[tuple[int, int], int]:
-        """Return places {(i, j): corner} of the connected part of a lattice around a seed.
-
-        The lattice grows along edges between neighbours. When no further edge is found, it skips single missing
-        corners.
-        """
-        places, where, step_of = {(0, 0): seed}, {seed: (0, 0)}, {seed: steps}
-        reach, frontier = 1, [seed]
-        while frontier:
-            asked = []
-            for corner in frontier:
-                step_of[corner] = np.array(local_steps(where[corner], places, self.pixels, step_of[corner]))
-                i, j = where[corner]
-                for di, dj in STEPS:
-                    if (place := (i + reach * di, j + reach * dj)) not in places:
-                        step = (di + dj) * step_of[corner][abs(dj)]
-                        asked.append((corner, place, self.pixels[corner] + reach * step, np.linalg.norm(step)))
-            frontier = []
-            if asked:
-                nearest = tree.query(np.array([at for _, _, at, _ in asked]), k=min(4, len(self.pixels)))
-                away, found = np.asarray(nearest[0]) / [[length] for *_, length in asked], np.asarray(nearest[1])
-                near = zip(*np.nonzero(away < LATTICE_RULE.tolerance), strict=True)
-                for ask, rank in sorted(near, key=lambda at: away[at]):
-                    (corner, place, _, _), other = asked[ask], int(found[ask, rank])
-                    if place not in places and other not in where and self._may_be_neighbours(corner, other, reach):
-                        places[place], where[other], step_of[other] = other, place, step_of[corner]
-                        frontier.append(other)
-            if frontier:
-                reach = 1
-            elif reach == 1:
-                reach, frontier = 2, list(where)
-        return places
-
-    def _may_be_neighbours(self, corner: int, other: int, reach: int) -> bool:
+    def may_be_neighbours(self, corner: int, other: int, reach: int) -> bool:
         """Return True if a step of one or two may connect two corners in the lattice."""
         if reach == 1:
             return bool(abs(self.measure_edges(np.array([corner]), np.array([other]))[0]) > _Rule.edge_contrast)
@@ -166,7 +133,8 @@ def find_board(grey: np.ndarray, columns: int, rows: int) -> np.ndarray | None:
             if number >= _Rule.most_seeds or len(found) >= columns * rows:
                 break
             if seed not in tried:
-                piece = corners.grow(seed, steps, tree)
+                same = corners.may_be_neighbours
+                piece = grow_lattice(seed, steps, corners.pixels, tree, nearest=4, may_be_neighbours=same)
                 tried.update(piece.values())
                 found = max(found, piece, key=len)
         board = _complete_board(_arrange_piece(found, corners), columns, rows, corners.grey)

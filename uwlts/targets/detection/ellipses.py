@@ -114,61 +114,25 @@ def _level_planes(grey, centres, shapes, reaches):
     blurred edge, which extends further on one side if the plate is inclined.
     """
     planes = np.zeros((len(centres), 2, 3))
-    inner, outer = reaches
-    _mean_levels(grey, centres, shapes, np.linalg.inv(shapes), inner, outer, DIRECTIONS, planes)
+    normals = DIRECTIONS @ np.linalg.inv(shapes)
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    rim = centres[:, None] + DIRECTIONS @ shapes
+    for side, reach in enumerate((-reaches[0], reaches[1])):
+        planes[:, side, 0] = sample_grey(grey, rim + reach[:, None, None] * normals).mean(1, dtype=float)
     if len(centres) > 1:
-        near = KDTree(centres).query(centres, k=min(RULE.neighbours + 1, len(centres)))[1]
-        _fit_slopes(centres, np.asarray(near), planes)
+        near = np.asarray(KDTree(centres).query(centres, k=min(RULE.neighbours + 1, len(centres)))[1])
+        levels = planes[:, :, 0]
+        change = levels[near] - levels[:, None]
+        like = np.abs(change) <= RULE.level_departure * np.abs(levels)[:, None]
+        weight = like / like.sum(1, keepdims=True)
+        apart = centres[near] - centres[:, None]
+        apart = apart[:, :, None] - np.einsum("nks,nku->nsu", weight, apart)[:, None]
+        squares = np.einsum("nks,nksu,nksv->nsuv", weight, apart, apart)
+        products = np.einsum("nks,nksu,nks->nsu", weight, apart, change)
+        # Collinear places determine the slope along their line only.
+        inverse = np.linalg.pinv(squares, rcond=RULE.on_a_line, hermitian=True)
+        planes[:, :, 1:] = (inverse @ products[..., None])[..., 0]
     return planes
-
-
-@compiled
-def _mean_levels(grey, centres, shapes, inverses, inner, outer, directions, planes):
-    """Set the mean levels (N, 2) on ellipses displaced inwards and outwards along the normals."""
-    around = directions.shape[0]
-    for n in range(len(centres)):
-        shape, inverse, inside, outside = shapes[n], inverses[n], 0.0, 0.0
-        for p in range(around):
-            e_u, e_v = directions[p, 0], directions[p, 1]
-            at_u = centres[n, 0] + shape[0, 0] * e_u + shape[0, 1] * e_v
-            at_v = centres[n, 1] + shape[0, 1] * e_u + shape[1, 1] * e_v
-            n_u, n_v = inverse[0, 0] * e_u + inverse[0, 1] * e_v, inverse[0, 1] * e_u + inverse[1, 1] * e_v
-            length = math.sqrt(n_u * n_u + n_v * n_v)
-            n_u, n_v = n_u / length, n_v / length
-            inside += _sample_bilinear(grey, at_u - inner[n] * n_u, at_v - inner[n] * n_v)
-            outside += _sample_bilinear(grey, at_u + outer[n] * n_u, at_v + outer[n] * n_v)
-        planes[n, 0, 0], planes[n, 1, 0] = inside / around, outside / around
-
-
-@compiled
-def _fit_slopes(places, near, planes):
-    """Fit slopes of planes through the values at each place (N, 2) and at the places ``near`` it (N, K).
-
-    Collinear places determine the slope along their line only.
-    """
-    for n in range(len(places)):
-        for side in range(2):
-            value = planes[n, side, 0]
-            count, su, sv, sz, uu, uv, vv, uz, vz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            for k in near[n]:
-                z = planes[k, side, 0] - value
-                if abs(z) <= RULE.level_departure * abs(value):
-                    u, v = places[k, 0] - places[n, 0], places[k, 1] - places[n, 1]
-                    count, su, sv, sz = count + 1.0, su + u, sv + v, sz + z
-                    uu, uv, vv, uz, vz = uu + u * u, uv + u * v, vv + v * v, uz + u * z, vz + v * z
-            uu, uv, vv = uu - su * su / count, uv - su * sv / count, vv - sv * sv / count
-            uz, vz = uz - su * sz / count, vz - sv * sz / count
-            determinant, middle = uu * vv - uv * uv, 0.5 * (uu + vv)
-            largest = middle + math.sqrt(max(middle * middle - determinant, 0.0))
-            if determinant > RULE.on_a_line * largest * largest:
-                slope_u, slope_v = (vv * uz - uv * vz) / determinant, (uu * vz - uv * uz) / determinant
-            else:
-                # Slope along the line of the places, the direction of the largest squares.
-                least = 2.0 * middle - largest
-                scale = 1.0 / (largest * max(largest - least, 1e-300)) if largest > 0.0 else 0.0
-                slope_u = scale * ((uu - least) * uz + uv * vz)
-                slope_v = scale * (uv * uz + (vv - least) * vz)
-            planes[n, side, 1], planes[n, side, 2] = slope_u, slope_v
 
 
 def _compute_centroids(grey, centres, shapes, reaches, planes):
@@ -425,45 +389,24 @@ def measure_marks(image, circles, *, mark_over_circle):
 RIM_POINTS = 16  # projected points on the rim of a circle
 
 
-def circle_centre_bias(project, centres_mm, *, diameter_mm, axis_u, axis_v):
+def circle_centre_bias(project, centres_mm, *, diameter_mm):
     """Return the offset of the centre of a circle's image from the image of the circle's centre.
 
     A detected centre minus this offset is the image of the circle's centre. For a pinhole camera the image is an
     ellipse and the offset is exact (J. Heikkila and O. Silven, A four-step camera calibration procedure, CVPR 1997,
     section 3.2). With distortion or refraction, the ellipse is fitted to the projected rim.
 
-    Parameters
-    ----------
-    project : callable
-        Maps points (M, 3) in mm, target frame, to pixels (M, 2).
-    centres_mm : (N, 3) array
-        Centres of the circles, target frame.
-    diameter_mm : float
-        Diameter of the circles.
-    axis_u, axis_v : (3,) array
-        Orthonormal vectors in the plane of the circles.
+    ``project`` maps points (M, 3) in mm, target frame, to pixels (M, 2). The circles with ``centres_mm`` (N, 3) are in
+    planes of constant z. Returns (N, 2) float64, (u, v) in px.
 
-    Returns
-    -------
-    (N, 2) float64
-        Offsets (u, v), px.
-
-    Raises
-    ------
-    RangeError
-        The diameter is not positive, the axes are not orthonormal, or the image of a circle is not an ellipse: the
-        circle extends behind the camera, or `project` fails.
+    Raises RangeError if the image of a circle is not an ellipse: the circle extends behind the camera, or ``project``
+    fails.
     """
-    axes = np.array([axis_u, axis_v], float)
-    if not np.allclose(axes @ axes.T, np.eye(2), rtol=0, atol=1e-9):
-        raise RangeError(f"axis_u and axis_v are {axes[0]} and {axes[1]}; expected orthonormal vectors")
-    if not (np.isfinite(diameter_mm) and diameter_mm > 0):
-        raise RangeError(f"the diameter is {diameter_mm} mm; expected a positive length")
     centres = np.asarray(centres_mm, float).reshape(-1, 3)
     if len(centres) == 0:
         return np.empty((0, 2))
     angle = np.arange(RIM_POINTS) * (2 * np.pi / RIM_POINTS)
-    rim = diameter_mm / 2 * np.stack([np.cos(angle), np.sin(angle)], 1) @ axes
+    rim = diameter_mm / 2 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
     points = np.concatenate([centres[:, None], centres[:, None] + rim], 1)
     pixels = np.asarray(project(points.reshape(-1, 3)), float).reshape(len(centres), RIM_POINTS + 1, 2)
     broken = ~np.isfinite(pixels).all((1, 2))

@@ -8,8 +8,6 @@ from scipy.spatial import KDTree
 from uwlts.errors import TargetError
 from uwlts.targets.detection.ellipses import Ellipses, find_circles
 
-STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))  # steps to the neighbours of a place in a lattice
-
 
 @dataclass(frozen=True, kw_only=True)
 class LatticeRule:
@@ -158,10 +156,14 @@ def label_lattice(centres, shapes):
     radii = np.sqrt(np.linalg.det(shapes))
     bases, sines = _find_bases(centres, shapes, tree)
     tried, places = np.zeros(len(centres), bool), {}
+
+    def are_alike(circle, other, _):
+        return 1 / LATTICE_RULE.size_ratio < radii[other] / radii[circle] < LATTICE_RULE.size_ratio
+
     for seed in _choose_seeds(centres, radii, bases, sines, tree):
         if tried[seed]:
             continue
-        grown = _grow_lattice(seed, centres, radii, bases[seed], tree)
+        grown = grow_lattice(seed, bases[seed], centres, tree, nearest=1, may_be_neighbours=are_alike)
         tried[list(grown.values())] = True
         places = max(places, grown, key=len)
         if len(places) >= np.count_nonzero(~tried):
@@ -216,52 +218,47 @@ def _choose_seeds(centres, radii, bases, sines, tree):
     return np.flatnonzero(usable)[np.argsort(score[usable])][: LATTICE_RULE.most_seeds]
 
 
-def _grow_lattice(seed, centres, radii, basis, tree):
-    """Return places {(i, j): circle} of the connected part of a lattice around a seed."""
+def grow_lattice(seed, basis, points, tree, *, nearest, may_be_neighbours):
+    """Return places {(i, j): point} of the connected part of a lattice around a seed with the steps ``basis`` (2, 2).
+
+    From each point the lattice grows by one local step along both axes, to one of the ``nearest`` points (N, 2) of the
+    place that ``may_be_neighbours(point, other, reach)`` accepts. When no further point is found, it skips single
+    missing points: ``reach`` is 2.
+    """
     # Complex numbers u + 1j v: arrays are slow for the single points of this loop.
-    points, sizes = (centres @ (1, 1j)).tolist(), radii.tolist()
+    at = (points @ (1, 1j)).tolist()
     places, where = {(0, 0): seed}, {seed: (0, 0)}
     steps = {seed: tuple((basis @ (1, 1j)).tolist())}
-    frontier, reach = [seed], 1
+    frontier, reach, ranks = [seed], 1, range(1, min(nearest, len(points)) + 1)
     while frontier:
-        expected, asked = [], []
-        for circle in frontier:
-            steps[circle] = local_steps(where[circle], places, points, steps[circle])
-            i, j = where[circle]
-            for di, dj in STEPS:
-                place = (i + reach * di, j + reach * dj)
-                if place not in places:
-                    expected.append(points[circle] + reach * (di * steps[circle][0] + dj * steps[circle][1]))
-                    asked.append((circle, place, abs(dj)))
-        fresh = []
+        asked, expected, lengths = [], [], []
+        for point in frontier:
+            steps[point] = _local_steps(where[point], places, at, steps[point])
+            i, j = where[point]
+            for di, dj in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+                if (place := (i + reach * di, j + reach * dj)) not in places:
+                    step = (di + dj) * steps[point][abs(dj)]
+                    asked.append((point, place))
+                    expected.append(at[point] + reach * step)
+                    lengths.append(abs(step))
+        frontier = []
         if asked:
-            nearby = np.array(expected, complex)
-            distance, index = tree.query(np.column_stack([np.real(nearby), np.imag(nearby)]))
-            for ask in np.argsort(distance, kind="stable").tolist():
-                (circle, place, axis), found = asked[ask], int(index[ask])
-                farthest = LATTICE_RULE.tolerance * abs(steps[circle][axis])
-                if place in places or found in where or distance[ask] > farthest:
-                    continue
-                if not 1 / LATTICE_RULE.size_ratio < sizes[found] / sizes[circle] < LATTICE_RULE.size_ratio:
-                    continue
-                places[place], where[found] = found, place
-                steps[found] = steps[circle]
-                fresh.append(found)
-        if fresh:
-            frontier, reach = fresh, 1
+            distance, index = tree.query(np.array(expected, complex).view(float).reshape(-1, 2), k=ranks)
+            ask_of, rank_of = np.nonzero(distance < LATTICE_RULE.tolerance * np.array(lengths)[:, None])
+            found, order = index[ask_of, rank_of].tolist(), np.argsort(distance[ask_of, rank_of], kind="stable")
+            for (point, place), other in ((asked[ask_of[k]], found[k]) for k in order.tolist()):
+                if place not in places and other not in where and may_be_neighbours(point, other, reach):
+                    places[place], where[other], steps[other] = other, place, steps[point]
+                    frontier.append(other)
+        if frontier:
+            reach = 1
         elif reach == 1:
-            # Finally skip single missing circles.
-            frontier, reach = list(where), 2
-        else:
-            frontier = []
+            reach, frontier = 2, list(where)
     return places
 
 
-def local_steps(place, places, points, inherited):
-    """Return the steps along i and j at a place: the mean over both neighbours, one neighbour, or as inherited.
-
-    Points are arrays (2,) or complex numbers.
-    """
+def _local_steps(place, places, points, inherited):
+    """Return the steps along i and j at a place: the mean over both neighbours, one neighbour, or as inherited."""
     i, j = place
     here = points[places[place]]
     steps = list(inherited)

@@ -103,11 +103,9 @@ def judged(small: Sensor, image: np.ndarray):
 
 def test_a_good_image_is_accepted(small):
     quality = judged(small, drawn_lamp(small, PLATE, target_pose()))
-    assert quality.reasons == () and quality.points == 99 and quality.share == 1.0
+    assert quality.reasons == () and quality.points == 99
     # Drawn with a blur of 0.6 px and pixels that average over themselves, 0.29 px; read from pixels' differences.
     assert 0.5 < quality.blur_px < 1.2
-    # Bright and dark differ by 140 of 255 grey levels.
-    assert quality.contrast == pytest.approx(140 / 255, abs=0.06) and quality.saturated == 0.0
 
 
 def test_blur_is_measured_and_refused(small):
@@ -119,9 +117,12 @@ def test_blur_is_measured_and_refused(small):
 
 def test_saturation_and_faintness_are_refused(small):
     bright = judged(small, drawn_lamp(small, PLATE, target_pose(), gain=1.6))
-    assert any(reason.startswith("saturated") for reason in bright.reasons) and bright.saturated > 0.1
+    (reason,) = [reason for reason in bright.reasons if reason.startswith("saturated")]
+    assert int(reason.split()[1]) > 10
     faint = judged(small, drawn_lamp(small, PLATE, target_pose(), gain=0.12, noise_dn=0.3))
     assert [reason[:5] for reason in faint.reasons] == ["faint"]
+    # Bright and dark differ by 140 of 255 grey levels, times the gain.
+    assert int(faint.reasons[0].split()[1]) == pytest.approx(0.12 * 140 / 2.55, abs=1)
 
 
 @pytest.mark.parametrize(("gain", "says"), [(0.01, "too dark"), (6.0, "saturated")])
