@@ -66,7 +66,7 @@ def display_points(points_mm: np.ndarray, field: CloudField, values: np.ndarray 
     """Return the view of points (N, 3) in the OCS, mm, coloured by values; see `choose_points`."""
     figures = FigureCollector()
     points, caption = choose_points(points_mm, field, values, most=MOST_SHOWN)
-    view = figures.add_cloud(points, caption, still="")
+    view = figures.add_cloud(points, caption)
     return CloudDisplay(render_page("uwlts.pages", "cloud_display.html.j2", interactive=figures, view=view))
 
 

@@ -21,8 +21,12 @@ from __future__ import annotations
 import base64
 import io
 import math
+import os
 import re
+import shutil
+import subprocess
 import sys
+import tempfile
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
@@ -35,6 +39,7 @@ from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup
 
 from uwlts._version import __version__
+from uwlts.errors import SetupError
 from uwlts.files.writing import refuse_unsuitable, write_atomically
 from uwlts.pages.cloud_figure import CloudPoints, view_scripts
 
@@ -44,13 +49,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
     Drawn = Figure | SubFigure | Axes
-
-import os
-import shutil
-import subprocess
-import tempfile
-
-from uwlts.errors import SetupError
 
 MISSING = "-"  # placeholder for a missing value in tables of text
 
@@ -157,20 +155,11 @@ def refuse_unsuitable_page(page: Path, *, kind: str = "", pdf: bool = False, ove
 
 @dataclass(frozen=True)
 class InteractiveFigure:
-    """Position of an interactive figure in a page."""
+    """Position of an interactive figure or cloud in a page; a figure has a height in px."""
 
     number: int
     caption: str
-    height: int
-
-
-@dataclass(frozen=True)
-class InteractiveCloud:
-    """Position of an interactive cloud in a page; ``still`` is the address of a picture for print, if any."""
-
-    number: int
-    caption: str
-    still: str
+    height: int = 0
 
 
 class FigureCollector:
@@ -185,10 +174,10 @@ class FigureCollector:
         self.scripts.append(_script_json(figure.to_json(validate=False) or ""))
         return InteractiveFigure(len(self.scripts) - 1, caption, int(figure.layout.height))
 
-    def add_cloud(self, points: CloudPoints, caption: str, *, still: str) -> InteractiveCloud:
-        """Add a cloud and the address of its picture."""
+    def add_cloud(self, points: CloudPoints, caption: str) -> InteractiveFigure:
+        """Add a cloud."""
         self.clouds.append(_script_json(points.to_json()))
-        return InteractiveCloud(len(self.clouds) - 1, caption, still)
+        return InteractiveFigure(len(self.clouds) - 1, caption)
 
 
 def _script_json(text: str) -> Markup:
@@ -224,25 +213,17 @@ def make_figure(
 
 
 def new_figure(
-    width: float = 5.6,
-    height: float = 3.2,
-    *,
-    rows: int = 1,
-    columns: int = 1,
-    height_ratios: list[float] | None = None,
-    width_ratios: list[float] | None = None,
-    shown: bool = False,
+    width: float = 5.6, height: float = 3.2, *, rows: int = 1, columns: int = 1, shown: bool = False
 ) -> tuple[Figure, list[Axes]]:
-    """Return a matplotlib figure in the pages' style, and its axes row by row.
+    """Return a matplotlib figure in the pages' style, of a size in inches, and its axes row by row.
 
-    Sizes are in inches, ratios relative heights of rows and widths of columns. ``shown``: `pyplot.show` and notebooks
-    show the figure.
+    ``shown``: `pyplot.show` and notebooks show the figure.
     """
     import matplotlib
 
     figure = make_figure(width, height, shown=shown)
     with matplotlib.rc_context(_STYLE):
-        axes = figure.subplots(rows, columns, squeeze=False, height_ratios=height_ratios, width_ratios=width_ratios)
+        axes = figure.subplots(rows, columns, squeeze=False)
         return figure, list(axes.flat)
 
 

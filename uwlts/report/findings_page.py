@@ -27,7 +27,7 @@ from uwlts.inspection.features import (
     Inspection,
 )
 from uwlts.inspection.inspect import InspectionKind, inspect_cloud
-from uwlts.model.any_calibration import calibration_digest
+from uwlts.model.calibration import calibration_digest
 from uwlts.model.sensor import Table
 from uwlts.pages.toolkit import (
     INK,
@@ -279,7 +279,7 @@ def _page(
         "findings.html.j2",
         title=title,
         made=made,
-        tiles=[tile for tile in _tiles(whole, parts) if tile.accent],
+        tiles=_tiles(parts),
         facts=_facts(order, cloud, sources, found),
         conclusion=_conclude(listed, order, found),
         findings=_finding_rows(listed, found, cloud, order) if listed else None,
@@ -403,7 +403,7 @@ def _rows(features: Sequence[Feature]) -> tuple[tuple[str, ...], list[tuple[str,
     return ("finding", "place / mm", *(f"{name} / {unit}" for name, unit in units.items())), rows
 
 
-def _tiles(whole: list[Feature], parts: list[Feature]) -> list[Tile]:
+def _tiles(parts: list[Feature]) -> list[Tile]:
     tiles = []
     for kind in _BLEMISHES:
         if own := [each for each in parts if each.kind == kind]:
@@ -416,10 +416,6 @@ def _tiles(whole: list[Feature], parts: list[Feature]) -> list[Tile]:
     if walls:
         least = min(walls, key=lambda value: value.value)
         tiles.append(Tile("least remaining wall", f"{format_interval(least)} {least.unit}", accent=True))
-    for each in whole[:1]:
-        for value in each.values[:5]:
-            if not value.name.startswith("axis"):
-                tiles.append(Tile(f"{each.name}: {value.name}", f"{format_interval(value)} {value.unit}"))
     return tiles
 
 

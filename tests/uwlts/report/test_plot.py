@@ -59,13 +59,11 @@ def test_plots_have_units_on_their_axes():
     points, nothing = np.column_stack([0 * y, y, 0 * y]), np.zeros(len(y), int)
     cloud = PointCloud(points, nothing, nothing, nothing, deviation_mm=0.01 * np.sin(y))
     calibration = nominal_calibration(load_sensor("thesis")).model_copy(update={"residuals": RESIDUALS})
-    lists = plot.residual_lists(calibration)
-    assert [(each.group, each.name) for each in lists] == [
-        ("camera", "image_rms_px"),
-        ("window", "errors_mm"),
-        ("window", "image_distances_mm"),
-    ]
+    lists = ["camera.image_rms_px", "window.errors_mm", "window.image_distances_mm"]
     flat = [plot.residuals(calibration, which=each) for each in lists]
+    assert plot.residuals(calibration).get_ylabel() == flat[0].get_ylabel() == "image rms / px"
+    with pytest.raises(plot.NothingToDrawError, match=f"it has {', '.join(lists)}"):
+        plot.residuals(calibration, which="camera.covariance")
     counts = {"image", ""}
     titles = [title for ax in flat for title in (ax.get_xlabel(), ax.get_ylabel())]
     assert all(title in counts or title.split(" / ")[-1] in ("mm", "µm", "px") for title in titles)
