@@ -1,5 +1,8 @@
-"""Calibration of a sensor for reconstruction, stored as readable JSON with residuals and provenance."""
+"""Calibrations of a sensor for reconstruction, by models or by polynomials, stored as JSON with their residuals."""
 
+import hashlib
+import json
+import weakref
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Literal
@@ -16,13 +19,26 @@ from pydantic import (
 
 from uwlts.argument_types import check_arguments
 from uwlts.errors import describe_problems
-from uwlts.files.json_files import write_model
+from uwlts.files.json_files import add_seal, write_model
+from uwlts.files.writing import require_ending, write_atomically
 from uwlts.model.joint_estimate import JointEstimate, Origin
 from uwlts.model.parameter_keys import SheetParameter
-from uwlts.model.sensor import Camera, Description, Distortion, Medium, Positive, Table, UnitVector, Vector, Window
+from uwlts.model.sensor import (
+    Camera,
+    Description,
+    Distortion,
+    Medium,
+    Positive,
+    Rows,
+    Table,
+    UnitVector,
+    Vector,
+    Window,
+)
 from uwlts.model.short_text import Brief
 
-FORMAT, VERSION = "uwlts-calibration", 1
+FORMAT, POLYNOMIALS_FORMAT, VERSION = "uwlts-calibration", "uwlts-polynomials", 1
+_Pair = tuple[float, float]
 
 _Rows = tuple[tuple[float, float, float, float], ...]
 
@@ -315,3 +331,94 @@ class Calibration(Brief, Description):
     def object_transform(self) -> np.ndarray:
         """Return ``T_camera_object`` as an array (4, 4)."""
         return np.array(self.camera_from_object)
+
+
+class PolynomialCalibration(Brief, Description):
+    """Sensor calibrated by polynomials for each line: stripe position to Z, and Z to Y (thesis section 4.7).
+
+    The calibration is valid only in its own medium, with the same window, and within the range of its evidence.
+
+    Both Legendre polynomials of a line have the degree ``degree``. ``depth_coefficients`` (Z of position) and
+    ``along_coefficients`` (Y of Z) have one row of coefficients in mm for each line; the first row belongs to
+    ``first_line``. In all lines, the arguments -1 to 1 correspond to ``position_range_px`` (stripe position) and
+    ``depth_range_mm`` (Z in the OCS). ``domains_px`` is the calibrated range of stripe positions of each line, None for
+    a line without calibration.
+    """
+
+    sensor_name: str
+    stripe_along: Literal["width", "height"]
+    wavelength_nm: Positive
+    medium_name: str
+    medium: Medium
+    window_mounted: bool
+    width_px: Annotated[int, Field(gt=0)]
+    height_px: Annotated[int, Field(gt=0)]
+    degree: Annotated[int, Field(ge=1)]
+    first_line: Annotated[int, Field(ge=0)]
+    position_range_px: _Pair
+    depth_range_mm: _Pair
+    domains_px: tuple[_Pair | None, ...]
+    depth_coefficients: Rows
+    along_coefficients: Rows
+    residuals: Residuals = {}
+    provenance: Table = {}
+
+    @property
+    def joint(self) -> None:
+        """Always None: polynomials come without a joint estimate."""
+
+    @model_validator(mode="after")
+    def _check_consistency(self) -> "PolynomialCalibration":
+        count, lines = len(self.domains_px), self.width_px if self.stripe_along == "width" else self.height_px
+        if not 0 < count <= lines - self.first_line:
+            raise ValueError(f"{count} lines from line {self.first_line} on do not fit an image of {lines} lines")
+        for name in ("depth_coefficients", "along_coefficients"):
+            if [*map(len, getattr(self, name))] != [self.degree + 1] * count:
+                expected = f"{count} rows of {self.degree + 1} numbers"
+                raise ValueError(f"{name} must have {expected}, as domains_px and degree")
+        for name in ("position_range_px", "depth_range_mm"):
+            low, high = getattr(self, name)
+            if not low < high:
+                raise ValueError(f"{name} must increase; found {low:g} to {high:g}")
+        low, high = self.position_range_px
+        known = [domain for domain in self.domains_px if domain is not None]
+        if not known or not all(low <= a <= b <= high for a, b in known):
+            raise ValueError("domains_px must have increasing ranges within position_range_px")
+        return self
+
+    @check_arguments
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the calibration as JSON, completely or not at all; OutputError if that fails."""
+        # One line for each key; with indentation, each of thousands of coefficients would take a line.
+        require_ending(Path(path), (".json",))
+        content = add_seal({"format": POLYNOMIALS_FORMAT, "version": VERSION} | self.model_dump(mode="json"))
+        lines = ",\n".join(f"  {json.dumps(key)}: {json.dumps(value)}" for key, value in content.items())
+        with write_atomically(path, overwrite=overwrite) as aside:
+            aside.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
+
+    def figures(self, step: str) -> Table:
+        """Return the figures of a calibration step; an empty table if there are none."""
+        return self.residuals.get(step, {})
+
+    def medium_index(self, medium: Medium) -> float:
+        """Return the index of a medium at the laser's wavelength, relative to air; RangeError outside the formula."""
+        return medium.refractive_index(self.wavelength_nm)
+
+    def domains(self) -> np.ndarray:
+        """Return ``domains_px`` as an array (L, 2) with NaN for None."""
+        return np.array([(np.nan, np.nan) if domain is None else domain for domain in self.domains_px])
+
+
+AnyCalibration = Calibration | PolynomialCalibration
+
+
+def calibration_digest(calibration: AnyCalibration) -> str:
+    """Return the short digest that identifies a calibration in clouds."""
+    if (digest := _digests.get(id(calibration))) is None:
+        digest = hashlib.sha256(calibration.model_dump_json().encode()).hexdigest()[:16]
+        _digests[id(calibration)] = digest
+        weakref.finalize(calibration, _digests.pop, id(calibration), None).atexit = False
+    return digest
+
+
+_digests: dict[int, str] = {}  # digests of calibrations in use, by `id`

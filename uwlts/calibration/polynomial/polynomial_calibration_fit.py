@@ -17,7 +17,7 @@ from uwlts.calibration.polynomial.polynomial_evidence import (
 )
 from uwlts.errors import CalibrationError, RangeError
 from uwlts.fitting.least_squares import DEFAULT_K, robust_std
-from uwlts.model.polynomial_calibration import PolynomialCalibration
+from uwlts.model.calibration import PolynomialCalibration
 from uwlts.model.short_text import Brief
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import Capture, CaptureHeader, open_captures
