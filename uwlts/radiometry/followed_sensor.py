@@ -1,4 +1,4 @@
-"""Description of a sensor with the values that the images of a scan show, and outlook for measurements in this water."""
+"""Description of a sensor with the values that images of a scan show, and outlook for measurements in this water."""
 
 from __future__ import annotations
 
