@@ -23,8 +23,7 @@ from uwlts.errors import CaptureError, DescriptionError, RangeError
 from uwlts.fitting.propagation import jackknife
 from uwlts.model.sensor import Table
 from uwlts.model.short_text import Brief, align_columns
-from uwlts.radiometry.image_sets import open_image_set
-from uwlts.radiometry.stripe_windows import STATISTICS, WINDOW_LINES, StripeWindows, measure_windows
+from uwlts.radiometry.stripe_windows import STATISTICS, WINDOW_LINES, StripeWindows, measure_windows, open_image_set
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.stripe import StripeSettings
 
