@@ -19,7 +19,7 @@ from pydantic import (
 
 from uwlts.argument_types import check_arguments
 from uwlts.errors import describe_problems
-from uwlts.files.json_files import add_seal, write_model
+from uwlts.files.json_files import add_seal, numbers_in, write_model
 from uwlts.files.writing import require_ending, write_atomically
 from uwlts.model.joint_estimate import JointEstimate, Origin
 from uwlts.model.parameter_keys import SheetParameter
@@ -73,12 +73,6 @@ def _check_figures(figures: Table) -> Table:
         if not isinstance(value := figures.get(name), int | float | None):
             raise ValueError(f"{name} is {value!r}; expected a number")
     return figures
-
-
-def _select_numbers(figures: object) -> dict[str, float]:
-    """Return the finite numbers among figures by name; empty if ``figures`` is not a table."""
-    known = figures.items() if isinstance(figures, dict) else ()
-    return {name: value for name, value in known if isinstance(value, int | float) and np.isfinite(value)}
 
 
 def _check_provenance(provenance: Table) -> Table:
@@ -282,14 +276,14 @@ class Calibration(Brief, Description):
 
     def std(self) -> CalibrationStd:
         """Return the stated standard uncertainties of camera, sheet and window."""
-        camera = _select_numbers(self.figures("camera").get("std"))
+        camera = numbers_in(self.figures("camera").get("std"))
         focal = camera.pop("f", None)
         known: Table = {f"{name}_px": camera.pop(name, focal) for name in ("fx", "fy")}
         known |= {f"{name}_px": camera.pop(name, None) for name in ("cx", "cy")}
         others = {
             "distortion": camera,
             "sheet_normal_deg": self._sheet_normal_std_deg(),
-            "window_distance_mm": _select_numbers(self.figures("window")).get("std_mm"),
+            "window_distance_mm": numbers_in(self.figures("window")).get("std_mm"),
         }
         return CalibrationStd.model_validate(known | others)
 
@@ -297,7 +291,7 @@ class Calibration(Brief, Description):
         """Return the largest standard uncertainty of the direction of the sheet's normal, deg."""
         turns = SheetParameter.TURN_FAN, SheetParameter.TURN_AXIS  # about two orthogonal axes in the sheet
         if self.joint is None or not set(turns) <= set(self.joint.parameters):
-            return _select_numbers(self.figures("sheet")).get("normal_std_deg")
+            return numbers_in(self.figures("sheet")).get("normal_std_deg")
         places = [self.joint.parameters.index(turn) for turn in turns]
         covariance = self.joint.covariance_matrix()[np.ix_(places, places)]
         return float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance)[-1])))

@@ -413,7 +413,7 @@ class Medium(Description):
     def _particles(self, wavelength_nm: float) -> media.Particles:
         if self.turbidity is not None:
             return media.particles_at(self.turbidity, wavelength_nm=wavelength_nm)
-        return media.find_water(self.water or "pure").particles(wavelength_nm)
+        return media.WATERS[self.water or "pure"].particles(wavelength_nm)
 
     def _phase_function(self) -> phase_functions.PhaseFunction:
         if isinstance(self.phase, phase_functions.DescribedPhase):
@@ -421,7 +421,7 @@ class Medium(Description):
         # The turbidity scale interpolates between Petzold's stations.
         name = self.phase or ("molecular" if self.turbidity is None else "petzold")
         if self.phase is None and self.water is not None:
-            name = media.find_water(self.water).phase
+            name = media.WATERS[self.water].phase
         parameters = {"asymmetry", "particle_index", "particle_slope", "backscatter_share"}
         keys = self.model_dump(include=parameters, exclude_none=True)
         return phase_functions.phase_function_kind(name).of_keys(keys)

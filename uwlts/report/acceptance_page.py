@@ -29,10 +29,9 @@ from uwlts.pages.toolkit import (
 )
 
 KIND = "acceptance"  # kind of the page, in the name of its JSON file
-_GREEN = "#2e8b57"
-_DECISIONS = {"conformity proven": _GREEN, "accepted": _GREEN, "nonconformity proven": RED, "rejected": RED}
-"""Colours of decisions; all others are open."""
-_OPEN = "#d9822b"
+_DECISIONS = {"conformity proven": "good", "accepted": "good", "nonconformity proven": "bad", "rejected": "bad"}
+"""Kinds of decisions; all others are open."""
+_COLOURS = {"good": "#2e8b57", "bad": RED, "open": "#d9822b"}
 _SIGNED = ("PS", "SD", "E")
 
 
@@ -85,7 +84,7 @@ def acceptance_page(acceptance: Acceptance) -> str:
         "acceptance.html.j2",
         title=plan.title,
         conclusion=f"{acceptance.conclusion[0].upper()}{acceptance.conclusion[1:]}.",
-        colour={_GREEN: "good", RED: "bad", _OPEN: "open"}[_colour_of(acceptance.verdict)],
+        colour=_DECISIONS.get(acceptance.verdict, "open"),
         facts=facts,
         characteristics=[_characteristic_row(each) for each in acceptance.characteristics],
         limits=_draw_limits(acceptance) if acceptance.values else None,
@@ -151,10 +150,6 @@ def _stated(value: float | None) -> str:
     return "not stated" if value is None else f"{value:g}"
 
 
-def _colour_of(decision: str) -> str:
-    return _DECISIONS.get(decision, _OPEN)
-
-
 def _draw_limits(acceptance: Acceptance) -> Markup:
     """Draw the values of each characteristic relative to its limit, the worst one with its interval."""
     limited = [each for each in acceptance.characteristics if each.mpe_mm is not None]
@@ -164,7 +159,7 @@ def _draw_limits(acceptance: Acceptance) -> Markup:
         shares = [abs(value.value_mm) / (each.limit_mm(value) or 1.0) for value in own]
         axes.plot(shares, [row] * len(shares), "o", markersize=3, color=SOFT, alpha=0.6)
         if each.worst is not None:
-            colour = _colour_of(each.decision)
+            colour = _COLOURS[_DECISIONS.get(each.decision, "open")]
             limit = each.limit_mm(each.worst) or 1.0
             half, middle = (each.worst.expanded_mm or 0.0) / limit, abs(each.worst.value_mm) / limit
             axes.errorbar(middle, row, xerr=half, fmt="o", color=colour, markersize=7, capsize=4, linewidth=2)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from uwlts.acceptance.accept import FORMAT as ACCEPTANCE, Acceptance, read_acceptance
 from uwlts.errors import CaptureError
 from uwlts.evaluation.evaluate import FORMAT as EVALUATION, Evaluation, read_evaluation
-from uwlts.files.json_files import read_json
+from uwlts.files.json_files import numbers_in, read_json
 from uwlts.files.reading import MOST_TOML_BYTES, is_regular_file, parse_toml, read_text, require_regular_file
 from uwlts.model.calibration import AnyCalibration, Calibration, PolynomialCalibration
 from uwlts.model.library import load_sensor
@@ -20,7 +20,6 @@ from uwlts.model.mount import FORMAT as MOUNT, BoardFound, Mount, SphereFound
 from uwlts.model.placement import check_design, view_of_sheet
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.model.trajectory import Trajectory, format_time
-from uwlts.pages.toolkit import numbers_in
 from uwlts.report.certificate import parameter_rows
 from uwlts.report.digital_certificate import digital_certificate_lines
 from uwlts.storage.calibration_file import FORMAT as CALIBRATION, POLYNOMIALS_FORMAT, load_calibration

@@ -6,8 +6,9 @@ Every function draws into ``ax``, or into a new figure in the style of the pages
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from itertools import product
-from typing import Any, assert_never
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,20 +18,10 @@ from mpl_toolkits.mplot3d import Axes3D, proj3d
 
 from uwlts.argument_types import check_arguments
 from uwlts.errors import ImageError
+from uwlts.files.json_files import number_list
 from uwlts.model.calibration import Calibration
-from uwlts.pages.cloud_figure import AZIMUTH_DEG, ELEVATION_DEG, STOPS, CloudField, colour_limit_mm, view_direction
-from uwlts.pages.toolkit import (
-    BLUE,
-    INK,
-    entries_of,
-    make_figure,
-    new_figure,
-    number_list,
-    plain_text,
-    split_name,
-    unit_for,
-    unit_of,
-)
+from uwlts.pages.cloud_figure import AZIMUTH_DEG, ELEVATION_DEG, STOPS, CloudField, scale_values, view_direction
+from uwlts.pages.toolkit import BLUE, INK, make_figure, new_figure, plain_text
 from uwlts.storage.capture import Frame
 from uwlts.storage.cloud import PointCloud
 from uwlts.stripe import Stripe
@@ -40,6 +31,15 @@ DEVIATIONS = LinearSegmentedColormap.from_list(
 )
 """Blue below, grey at zero, red above."""
 
+_STYLES: dict[CloudField, tuple[str, Any]] = {
+    "deviation": ("deviation", DEVIATIONS),
+    "depth": ("Z", "viridis"),
+    "intensity": ("brightness", "cividis"),
+    "random": ("random standard uncertainty", "viridis"),
+    "common": ("common standard uncertainty", "viridis"),
+}
+"""Names and colours of the quantities of points."""
+
 UNKNOWN = "#555550"
 """Colour of points without a deviation in a cloud with deviations."""
 PLAIN = "#5d82a8"
@@ -48,6 +48,7 @@ ORANGE = "#ff7800"
 """Colour of stripe centres."""
 _SHORT_LIST = 3  # lists of residuals up to this length are not drawn
 
+_UNITS = {"px": "px", "mm": "mm", "deg": "°", "rad": "rad", "nm": "nm"}  # of names of residuals
 # Residuals within this ratio are drawn as dots: bars, which start at zero, would all look the same.
 _FLAT = 1.2
 # Fraction of a surface's points within the colour range.
@@ -99,21 +100,23 @@ def cloud(cloud: PointCloud, ax: Axes3D | None = None, colour: CloudField = "dev
     low, high = (low + high) / 2 - half, (low + high) / 2 + half
     # The farthest points are drawn first, so that the nearest remain visible.
     points = cloud.points_mm[order := np.argsort(-(cloud.points_mm @ view_direction()), kind="stable")]
-    values, label, scale = _select_values(cloud, colour)
+    values = cloud.field_values(colour)
     size = float(np.clip(1e5 / len(cloud), 1.0, 16.0))
     style: dict[str, Any] = {"s": size, "linewidths": 0, "depthshade": False, "rasterized": True}
-    if values is None:
+    if values is None or not np.isfinite(values).any():
         ax.scatter(*points.T, color=PLAIN, **style)
         if bar is not None:
             bar.remove()
     else:
-        values = values[order]
+        values, unit, limit = scale_values(values[order], colour)
         known = np.isfinite(values)
         if not known.all():
             ax.scatter(*points[~known].T, color=UNKNOWN, label="not evaluated", **style)
             ax.legend(loc="upper left", bbox_to_anchor=(0, 1), bbox_transform=legend_at, markerscale=3, frameon=False)
-        drawn = ax.scatter(*points[known].T, c=values[known], **style, **scale)
-        ax.figure.colorbar(drawn, cax=bar, ax=None if bar else ax, label=label)
+        style |= {} if limit is None else {"vmin": -limit, "vmax": limit}
+        name, colours = _STYLES[colour]
+        drawn = ax.scatter(*points[known].T, c=values[known], cmap=colours, **style)
+        ax.figure.colorbar(drawn, cax=bar, ax=None if bar else ax, label=f"{name} / {unit}")
     for axis, name, start, end in zip((ax.xaxis, ax.yaxis, ax.zaxis), "XYZ", low, high, strict=True):
         axis.set_label_text(f"{name} / mm")
         axis.labelpad = 18
@@ -126,30 +129,6 @@ def cloud(cloud: PointCloud, ax: Axes3D | None = None, colour: CloudField = "dev
     width, height = room[0] * ax.viewLim.width / np.ptp(x), room[1] * ax.viewLim.height / np.ptp(y)
     ax.set_box_aspect(high - low, zoom=min(width, height))
     return ax
-
-
-def _select_values(cloud: PointCloud, colour: CloudField) -> tuple[np.ndarray | None, str, dict[str, Any]]:
-    """Return values (N,) with label and style; None if the cloud does not have them."""
-    values = cloud.field_values(colour)
-    if values is None:
-        return None, "", {}
-    match colour:
-        case "deviation":
-            if not np.isfinite(values).any():
-                return None, "", {}
-            limit = colour_limit_mm(values)
-            unit, factor = unit_for(limit)
-            style = {"cmap": DEVIATIONS, "vmin": -factor * limit, "vmax": factor * limit}
-            return factor * values, f"deviation / {unit}", style
-        case "depth":
-            return values, "Z / mm", {"cmap": "viridis"}
-        case "intensity":
-            return values, "brightness / grey levels", {"cmap": "cividis"}
-        case "random" | "common":
-            unit, factor = unit_for(float(np.median(values)))
-            return factor * values, f"{colour} standard uncertainty / {unit}", {"cmap": "viridis"}
-        case _:
-            assert_never(colour)
 
 
 def deviation_colours(deviation_mm: np.ndarray, limit_mm: float) -> np.ndarray:
@@ -254,7 +233,7 @@ def residuals(calibration: Calibration, ax: Axes | None = None, *, which: str | 
     """
     lists = {
         f"{group}.{name}": values
-        for group, name, value in entries_of(calibration.residuals_in_file())
+        for group, name, value in _entries_of(calibration.residuals_in_file())
         if len(values := number_list(value) or ()) > _SHORT_LIST and any(each is not None for each in values)
     }
     if which is None and not lists:
@@ -274,7 +253,9 @@ def residuals(calibration: Calibration, ax: Axes | None = None, *, which: str | 
     else:
         ax.bar(places, heights, color="#7fa6cc")
         ax.axhline(0, color=INK, linewidth=0.8)
-    words, unit = split_name(name), unit_of(name)
+    stem, _, ending = name.rpartition("_")
+    unit = _UNITS.get(ending, "") if stem else ""
+    words = (stem if unit else name).replace("_", " ")
     ax.set(
         xlabel="image" if images or "image" in name else "number",
         ylabel=plain_text(f"{words} / {unit}" if unit else words),
@@ -284,6 +265,15 @@ def residuals(calibration: Calibration, ax: Axes | None = None, *, which: str | 
             places, list(map(plain_text, images)), rotation=40, ha="right", rotation_mode="anchor", fontsize=7
         )
     return ax
+
+
+def _entries_of(table: Mapping[str, Any], group: str = "") -> Iterator[tuple[str, str, Any]]:
+    """Iterate over group, name and value of the entries of nested tables; a group is the names of its tables."""
+    for name, value in table.items():
+        if isinstance(value, dict):
+            yield from _entries_of(value, f"{group} {name}".strip())
+        else:
+            yield group, name, value
 
 
 def _axes(ax: Axes | None, *size: float) -> Axes:
