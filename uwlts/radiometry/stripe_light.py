@@ -33,6 +33,7 @@ from uwlts.model.placement import LaserPose, apparent_depth_mm, laser_pose
 from uwlts.model.sensor import Camera, CaptureHeader, Laser, Sensor, Window
 from uwlts.model.stripe import CaptureStripes, stack_pixels
 from uwlts.optics.camera import directions
+from uwlts.optics.design import WindowGeometry, length_outside_mm, trace_to_points
 from uwlts.optics.triangulation import points_on_sheet, rays_on_sheet, to_object
 from uwlts.optics.window import RayStatus, trace_window
 
@@ -44,7 +45,6 @@ _FEWEST_POSITIONS = 5
 """Least number of stage positions of a scan: those of one plane for a normal."""
 _STEPS = 2.5
 """Radius of the planes that give the normals, in steps of the stage: five images, also on inclined surfaces."""
-_NEWTON_STEPS = 8  # of the ray through the window; converges quadratically
 _JOULE_NM = 6.62607015e-34 * 299792458.0 * 1e9
 """Energy of a photon times its wavelength in nm, J nm (SI)."""
 _LEAST_MM = 1e-3
@@ -197,32 +197,22 @@ def _fan_light(
     """Return the fan's light at points (N, 3), by refraction at a window normal to the axis.
 
     These are directions (N, 3), power per length across the rays for 1 mW (1/mm), paths in the medium, and angles in
-    air divided by half the fan angle.
-
-    The ray at the angle a in air has the angles g in glass and m in the medium. Behind the lengths d, t and w along the
-    axis, it is at y = d tan a + t tan g + w tan m. The power per length across a ray is P'(a) / (dy/da cos m).
+    air divided by half the fan angle. The power per length across a ray at the angles a in air and m in the medium is
+    P'(a) / (dy/da cos m), with the point's distance y from the axis.
     """
     away = point - pose.origin_mm
     y, z = away @ pose.fan, away @ pose.axis
-    window = laser.window
-    parts = [(0.0, 1.0), (0.0, 1.0), (z, medium_index)]
-    if window.mounted:
-        glass = window.index(laser.wavelength_nm)
-        inside = window.distance_mm, window.thickness_mm
-        parts = [(inside[0], 1.0), (inside[1], glass), (z - sum(inside), medium_index)]
-    sine, by_sine = y / np.hypot(y, z), np.ones_like(y)
-    for _ in range(_NEWTON_STEPS):
-        reach, by_sine = np.zeros_like(y), np.zeros_like(y)
-        for length, n in parts:
-            cosine = np.sqrt(1 - (sine / n) ** 2)
-            reach += length * sine / (n * cosine)
-            by_sine += length / (n * cosine**3)
-        sine = np.clip(sine - (reach - y) / by_sine, -0.99, 0.99)
-    tilt = np.sqrt(1 - (sine / medium_index) ** 2)
-    angle = np.arcsin(sine)
-    direction = (sine / medium_index)[:, None] * pose.fan + tilt[:, None] * pose.axis
-    per_mm = _power_per_rad(laser, angle) / (by_sine * np.cos(angle) * tilt)
-    return direction, per_mm, parts[2][0] / tilt, angle / math.radians(laser.fan_angle_deg / 2)
+    inside, glass = (0.0, 0.0), 1.0
+    if (window := laser.window).mounted:
+        inside, glass = (window.distance_mm, window.thickness_mm), window.index(laser.wavelength_nm)
+    geometry = WindowGeometry((0.0, 0.0, 1.0), *inside, glass, medium_index)
+    ray = trace_to_points(np, geometry, (y, np.zeros_like(y), z))
+    tilt = 1 / np.sqrt(1 + ray.slope_outside**2)
+    angle = np.copysign(np.arctan(ray.slope), y)
+    direction = tilt[:, None] * (np.copysign(ray.slope_outside, y)[:, None] * pose.fan + pose.axis)
+    per_mm = _power_per_rad(laser, angle) / (ray.growth_mm * (1 + ray.slope**2) * tilt)
+    path = length_outside_mm(np, geometry, ray)
+    return direction, per_mm, path, angle / math.radians(laser.fan_angle_deg / 2)
 
 
 def _power_per_rad(laser: Laser, angle: np.ndarray) -> np.ndarray:
