@@ -8,7 +8,7 @@ from markupsafe import Markup
 
 from uwlts.acceptance.accept import FORMAT, VERSION, Acceptance, JudgedPosition
 from uwlts.acceptance.acceptance_plan import SYMBOLS, CertifiedArtefact, Symbol
-from uwlts.acceptance.characteristics import NAMES, RULES, Characteristic, CharacteristicValue
+from uwlts.acceptance.characteristics import NAMES, RULES, Characteristic
 from uwlts.files.json_files import json_text
 from uwlts.model.artefacts import SphereStandard, StepStandard
 from uwlts.pages.toolkit import (
@@ -197,8 +197,11 @@ def _draw_lengths(acceptance: Acceptance) -> Markup:
     """Draw the error of each length with its test value uncertainty and limit."""
     lengths = [value for value in acceptance.values if value.length_mm is not None]
     figure, (axes,) = new_figure(9.0, 3.6)
-    judged = {each.symbol: each for each in acceptance.characteristics}
+    judged, labels = {each.symbol: each for each in acceptance.characteristics}, []
     for place, value in enumerate(lengths):
+        along = "XYZ"[int(np.argmax(np.abs(value.direction)))] if value.direction else ""
+        size = f"{value.symbol}, {value.length_mm or 0.0:.0f} mm, mostly along {along}"
+        labels.append(plain_text(f"{value.position} ({size})"))
         axes.errorbar(
             place, 1e3 * value.value_mm, yerr=1e3 * (value.expanded_mm or 0.0), fmt="o", color=BLUE, capsize=4
         )
@@ -206,11 +209,6 @@ def _draw_lengths(acceptance: Acceptance) -> Markup:
             for sign in (-1, 1):
                 axes.plot([place - 0.35, place + 0.35], [sign * 1e3 * limit] * 2, color=RED, linewidth=1.5)
     axes.axhline(0, color=INK, linewidth=0.8)
-    axes.set_xticks(range(len(lengths)), [_length_label(each) for each in lengths], fontsize=8, rotation=30, ha="right")
+    axes.set_xticks(range(len(lengths)), labels, fontsize=8, rotation=30, ha="right")
     axes.set_ylabel("error / µm")
     return figure_svg(figure)
-
-
-def _length_label(value: CharacteristicValue) -> str:
-    along = "XYZ"[int(np.argmax(np.abs(value.direction)))] if value.direction else ""
-    return plain_text(f"{value.position} ({value.symbol}, {value.length_mm or 0.0:.0f} mm, mostly along {along})")
