@@ -1,9 +1,8 @@
 """Templates, style, figures, numbers and files shared by all HTML pages.
 
-A page is a Jinja template that extends ``base.html.j2`` and imports what it needs from ``components.html.j2``::
+A page is a Jinja template that extends ``base.html.j2`` and uses the macros of ``components.html.j2``::
 
     {% extends "base.html.j2" %}
-    {% from "components.html.j2" import tiles, facts, table, picture, chart %}
     {% block title %}Measurement report{% endblock %}
     {% block content %}{{ tiles(key_figures) }} ... {{ chart(cloud) }}{% endblock %}
 
@@ -89,6 +88,8 @@ def render_page(package: str, template: str, /, *, interactive: FigureCollector 
     loader = FileSystemLoader([own, own / "templates", templates])
     environment = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters["minus"] = typeset_number
+    components = environment.get_template("components.html.j2").module
+    environment.globals |= {name: part for name, part in vars(components).items() if not name.startswith("_")}
     collected = FigureCollector() if interactive is None else interactive
     scripts, clouds, plotly = collected.scripts, collected.clouds, ""
     if scripts:

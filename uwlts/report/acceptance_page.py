@@ -70,7 +70,7 @@ def acceptance_page(acceptance: Acceptance) -> str:
     measured: list[Symbol] = [
         symbol for symbol in SYMBOLS if any(value.symbol == symbol for value in acceptance.values)
     ]
-    facts = [
+    statements = [
         ("sensor", plan.sensor or "not stated"),
         ("client", plan.client or "not stated"),
         ("operator", plan.operator or "not stated"),
@@ -85,7 +85,7 @@ def acceptance_page(acceptance: Acceptance) -> str:
         title=plan.title,
         conclusion=f"{acceptance.conclusion[0].upper()}{acceptance.conclusion[1:]}.",
         colour=_DECISIONS.get(acceptance.verdict, "open"),
-        facts=facts,
+        statements=statements,
         characteristics=[_characteristic_row(each) for each in acceptance.characteristics],
         limits=_draw_limits(acceptance) if acceptance.values else None,
         places=_draw_places(acceptance) if acceptance.values else None,
