@@ -197,8 +197,8 @@ def _fan_light(
     """Return the fan's light at points (N, 3), by refraction at a window normal to the axis.
 
     These are directions (N, 3), power per length across the rays for 1 mW (1/mm), paths in the medium, and angles in
-    air divided by half the fan angle. A ray at the angles a in air and m in the medium carries P'(a) / (dy/da cos m)
-    per length across it, where y is the point's distance from the axis.
+    air divided by half the fan angle. A ray has the angles a in air and m in the medium, and ends at the distance y
+    from the axis. The power per length across it is P'(a) / (dy/da cos m).
     """
     away = point - pose.origin_mm
     y, z = away @ pose.fan, away @ pose.axis
