@@ -30,8 +30,6 @@ AnyDescription = TypeVar("AnyDescription", bound=Description)
 
 _MOST_PROBLEMS = 30  # of a description that a message lists
 _NO_TOML = "is not valid TOML"
-_MOST_BASES = 16
-"""Largest length of a chain of bases; the shipped descriptions have two."""
 _SAME_WAVELENGTH_NM = 5.0  # lasers of the same type differ by less
 _SAME = 0.1  # relative change of a length, an angle or a power that can be an adjustment of the same part
 _BLUR_PX = 2.0
@@ -98,8 +96,6 @@ def read_levels(path: Path, folder: str = "", *, seen: tuple[Path, ...] = ()) ->
     text = read_text(path, most_bytes=MOST_TOML_BYTES, error=DescriptionError, called="description", foreign=_NO_TOML)
     if path.resolve() in seen:
         raise DescriptionError(f"{path} is its own base: {' -> '.join(p.name for p in (*seen, path))}")
-    if len(seen) == _MOST_BASES:
-        raise DescriptionError(f"{path}: more than {_MOST_BASES} bases in a chain; use fewer")
     try:
         table = parse_toml(text)
     except ValueError as error:
