@@ -29,6 +29,7 @@ from uwlts.model.sensor import (
     Distortion,
     Medium,
     Positive,
+    RigidTransform,
     Rows,
     Table,
     UnitVector,
@@ -40,31 +41,12 @@ from uwlts.model.short_text import Brief
 FORMAT, POLYNOMIALS_FORMAT, VERSION = "uwlts-calibration", "uwlts-polynomials", 1
 _Pair = tuple[float, float]
 
-_Rows = tuple[tuple[float, float, float, float], ...]
-
-
-def is_rigid(matrices: np.ndarray, *, within: float) -> bool:
-    """Return whether matrices (..., 4, 4) are rigid transforms without reflection; ``within`` is the tolerance."""
-    rotation = matrices[..., :3, :3]
-    if not (np.abs(rotation) < 2).all() or not np.isfinite(matrices).all():
-        return False
-    square = np.allclose(rotation @ np.swapaxes(rotation, -1, -2), np.eye(3), atol=within)
-    last = np.allclose(matrices[..., 3, :], (0, 0, 0, 1), atol=within)
-    return square and last and bool((np.linalg.det(rotation) > 0).all())
-
 
 def rigid_transform(rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
     """Return the matrix (4, 4) of a rotation (3, 3) and a translation (3,)."""
     result = np.eye(4)
     result[:3, :3], result[:3, 3] = rotation, shift
     return result
-
-
-def _check_rigid(matrix: _Rows) -> _Rows:
-    """Raise ValueError unless a matrix (4, 4) is a rigid transform to 1e-6 (text may be rounded)."""
-    if len(matrix) == 4 and is_rigid(np.array(matrix), within=1e-6):
-        return matrix
-    raise ValueError("must be a 4x4 rigid transform: rotation, translation, and last row 0 0 0 1")
 
 
 def _check_figures(figures: Table) -> Table:
@@ -84,7 +66,6 @@ def _check_provenance(provenance: Table) -> Table:
     return provenance
 
 
-RigidTransform = Annotated[_Rows, AfterValidator(_check_rigid)]
 Residuals = dict[str, Annotated[Table, AfterValidator(_check_figures)]]
 """Named figures of each step of a calibration."""
 
