@@ -89,7 +89,7 @@ def render_page(package: str, template: str, /, *, interactive: FigureCollector 
     environment = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters["minus"] = typeset_number
     components = environment.get_template("components.html.j2").module
-    environment.globals |= {name: part for name, part in vars(components).items() if not name.startswith("_")}
+    environment.globals.update({name: part for name, part in vars(components).items() if not name.startswith("_")})
     collected = FigureCollector() if interactive is None else interactive
     scripts, clouds, plotly = collected.scripts, collected.clouds, ""
     if scripts:
