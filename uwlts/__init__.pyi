@@ -16,10 +16,9 @@ from .inspection.features import Inspection as Inspection
 from .inspection.flat import inspect_flange as inspect_flange, inspect_gap as inspect_gap, inspect_step as inspect_step
 from .inspection.pipe import inspect_pipe as inspect_pipe
 from .inspection.weld import inspect_weld as inspect_weld
-from .model.calibration import Calibration as Calibration
+from .model.calibration import Calibration as Calibration, PolynomialCalibration as PolynomialCalibration
 from .model.library import load_sensor as load_sensor
 from .model.mount import Mount as Mount
-from .model.polynomial_calibration import PolynomialCalibration as PolynomialCalibration
 from .model.sensor import Sensor as Sensor
 from .model.trajectory import Trajectory as Trajectory
 from .optics.nominal import design as design, nominal as nominal

@@ -19,8 +19,7 @@ from result_tables import publish, table
 import twin
 from twin.scene.description import Scene
 from twin.scene.surfaces import Finish
-from uwlts.radiometry.image_sets import open_image_set
-from uwlts.radiometry.stripe_windows import STATISTICS, measure_windows
+from uwlts.radiometry.stripe_windows import STATISTICS, measure_windows, open_image_set
 
 PICTURE = Path(__file__).resolve().parents[1] / "pictures" / "surface-finishes.png"
 SHOWN = ("scatter", "correlation", "lowest", "gaps")

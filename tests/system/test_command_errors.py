@@ -22,7 +22,8 @@ from twin import cli as twin_cli
 from uwlts import cli as uwlts_cli
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor
-from uwlts.report.plot import DEVIATIONS, colour_limit_mm
+from uwlts.pages.cloud_figure import colour_limit_mm
+from uwlts.report.plot import DEVIATIONS
 from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter

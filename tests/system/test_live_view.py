@@ -17,7 +17,7 @@ from uwlts.desk import recording_view
 from uwlts.desk.recording_view import RecordingView, follow_frames
 from uwlts.desk.shown_state import Board
 from uwlts.errors import CaptureError
-from uwlts.model.any_calibration import AnyCalibration
+from uwlts.model.calibration import AnyCalibration
 from uwlts.model.sensor import Sensor
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, part_path

@@ -150,7 +150,7 @@ class ExperimentResult(Brief, BaseModel, frozen=True):
         for name, path in clouds.items():
             cloud = read_cloud(path)
             points = choose_points(cloud.points_mm, "deviation", cloud.field_values("deviation"), most=_MOST_POINTS)
-            shown.append((name, collected.add_cloud(*points, still="")))
+            shown.append((name, collected.add_cloud(*points)))
         return render_page(
             "twin.experiments",
             "page.html.j2",

@@ -27,8 +27,8 @@ from uwlts.files.json_files import EDITED, read_model, to_canonical_json, write_
 from uwlts.files.reading import is_regular_file
 from uwlts.files.writing import hash_file
 from uwlts.fitting.least_squares import VDI_OUTLIER_SHARE
-from uwlts.model.any_calibration import AnyCalibration, calibration_digest
 from uwlts.model.artefacts import PlaneStandard, SphereStandard
+from uwlts.model.calibration import AnyCalibration, calibration_digest
 from uwlts.model.short_text import Brief
 from uwlts.reconstruction.reconstruct import reconstruct
 from uwlts.runtime.progress import ProgressListener, ignore_progress

@@ -97,7 +97,7 @@ def camera(
     overwrite: Overwrite = False,
 ) -> None:
     """Example: uwlts camera photographs --target board.toml --out camera.yaml"""
-    from uwlts.report.camera_page import camera_lines
+    from uwlts.report.calibration_pages import camera_lines
 
     found, page = call(), out.with_suffix(".html")
     found.save(out, overwrite=overwrite)

@@ -33,7 +33,7 @@ from uwlts.hardware.guided.record import guide
 from uwlts.hardware.rig import START_MS, HandSwitchedLaser, LaserStage, Rig, get_stripe, measure_brightness
 from uwlts.hardware.scan_plan import Light, ScanPlan
 from uwlts.hardware.scanning import check_camera, open_camera, record_scan
-from uwlts.model.any_calibration import AnyCalibration
+from uwlts.model.calibration import AnyCalibration
 from uwlts.model.sensor import Sensor
 from uwlts.report.file_description import calibration_lines
 from uwlts.storage.calibration_file import load_calibration

@@ -13,7 +13,7 @@ import numpy as np
 from uwlts.desk.server import DeskServer
 from uwlts.desk.shown_state import Board, FrameProfile, Picture
 from uwlts.errors import CaptureError
-from uwlts.model.any_calibration import AnyCalibration
+from uwlts.model.calibration import AnyCalibration
 from uwlts.storage.calibration_file import resolve_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, drawable_image, part_path
 from uwlts.stripe import find_stripe, warm_up

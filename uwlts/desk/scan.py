@@ -32,7 +32,7 @@ from uwlts.hardware.continuous import ScanListeners
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.scan_plan import ScanPlan, load_plan
 from uwlts.hardware.scanning import ScanProgress, open_camera, record_scan
-from uwlts.model.any_calibration import AnyCalibration
+from uwlts.model.calibration import AnyCalibration
 from uwlts.optics.fitness import check_fits
 from uwlts.runtime.optional_library import pip_install
 from uwlts.runtime.progress import ProgressListener, ignore_progress

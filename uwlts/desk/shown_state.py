@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 
 from uwlts.inspection.picking import Section, order_profile
-from uwlts.model.any_calibration import AnyCalibration
-from uwlts.model.calibration import Calibration
+from uwlts.model.calibration import AnyCalibration, Calibration
 from uwlts.pages.cloud_figure import CloudField
 from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.storage.capture import CaptureHeader, Frame, FrameTable

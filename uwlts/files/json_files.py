@@ -6,9 +6,10 @@ result records that it was edited.
 
 import hashlib
 import json
+import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeGuard, TypeVar
 
 from pydantic import BaseModel, JsonValue, ValidationError
 
@@ -42,6 +43,21 @@ def add_seal(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return the content as JSON, with its seal."""
     plain = json.loads(_dump(content))
     return plain | {SEAL: compute_seal(plain)}
+
+
+def is_number(value: Any) -> TypeGuard[float]:
+    """Return whether a value from JSON is a finite number."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def number_list(value: Any) -> list[float | None] | None:
+    """Return a list from JSON if it contains only finite numbers and None, else None."""
+    return value if isinstance(value, list) and all(each is None or is_number(each) for each in value) else None
+
+
+def numbers_in(table: Any) -> dict[str, float]:
+    """Return the finite numbers in a table from JSON by name; empty if the value is not a table."""
+    return {name: value for name, value in table.items() if is_number(value)} if isinstance(table, dict) else {}
 
 
 def read_json(path: str | Path, *, called: str, check_seal: bool = True) -> dict[str, JsonValue]:

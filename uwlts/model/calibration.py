@@ -1,5 +1,8 @@
-"""Calibration of a sensor for reconstruction, stored as readable JSON with residuals and provenance."""
+"""Calibrations of a sensor for reconstruction, by models or by polynomials, stored as JSON with their residuals."""
 
+import hashlib
+import json
+import weakref
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Literal
@@ -16,25 +19,27 @@ from pydantic import (
 
 from uwlts.argument_types import check_arguments
 from uwlts.errors import describe_problems
-from uwlts.files.json_files import write_model
+from uwlts.files.json_files import add_seal, numbers_in, write_model
+from uwlts.files.writing import require_ending, write_atomically
 from uwlts.model.joint_estimate import JointEstimate, Origin
 from uwlts.model.parameter_keys import SheetParameter
-from uwlts.model.sensor import Camera, Description, Distortion, Medium, Positive, Table, UnitVector, Vector, Window
+from uwlts.model.sensor import (
+    Camera,
+    Description,
+    Distortion,
+    Medium,
+    Positive,
+    RigidTransform,
+    Rows,
+    Table,
+    UnitVector,
+    Vector,
+    Window,
+)
 from uwlts.model.short_text import Brief
 
-FORMAT, VERSION = "uwlts-calibration", 1
-
-_Rows = tuple[tuple[float, float, float, float], ...]
-
-
-def is_rigid(matrices: np.ndarray, *, within: float) -> bool:
-    """Return whether matrices (..., 4, 4) are rigid transforms without reflection; ``within`` is the tolerance."""
-    rotation = matrices[..., :3, :3]
-    if not (np.abs(rotation) < 2).all() or not np.isfinite(matrices).all():
-        return False
-    square = np.allclose(rotation @ np.swapaxes(rotation, -1, -2), np.eye(3), atol=within)
-    last = np.allclose(matrices[..., 3, :], (0, 0, 0, 1), atol=within)
-    return square and last and bool((np.linalg.det(rotation) > 0).all())
+FORMAT, POLYNOMIALS_FORMAT, VERSION = "uwlts-calibration", "uwlts-polynomials", 1
+_Pair = tuple[float, float]
 
 
 def rigid_transform(rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
@@ -44,25 +49,12 @@ def rigid_transform(rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
     return result
 
 
-def _check_rigid(matrix: _Rows) -> _Rows:
-    """Raise ValueError unless a matrix (4, 4) is a rigid transform to 1e-6 (text may be rounded)."""
-    if len(matrix) == 4 and is_rigid(np.array(matrix), within=1e-6):
-        return matrix
-    raise ValueError("must be a 4x4 rigid transform: rotation, translation, and last row 0 0 0 1")
-
-
 def _check_figures(figures: Table) -> Table:
     """Raise ValueError unless the figures that commands print and plot are numbers or missing."""
     for name in ("rms_px", "rms_mm", "max_mm", "std_mm"):
         if not isinstance(value := figures.get(name), int | float | None):
             raise ValueError(f"{name} is {value!r}; expected a number")
     return figures
-
-
-def _select_numbers(figures: object) -> dict[str, float]:
-    """Return the finite numbers among figures by name; empty if ``figures`` is not a table."""
-    known = figures.items() if isinstance(figures, dict) else ()
-    return {name: value for name, value in known if isinstance(value, int | float) and np.isfinite(value)}
 
 
 def _check_provenance(provenance: Table) -> Table:
@@ -74,7 +66,6 @@ def _check_provenance(provenance: Table) -> Table:
     return provenance
 
 
-RigidTransform = Annotated[_Rows, AfterValidator(_check_rigid)]
 Residuals = dict[str, Annotated[Table, AfterValidator(_check_figures)]]
 """Named figures of each step of a calibration."""
 
@@ -266,14 +257,14 @@ class Calibration(Brief, Description):
 
     def std(self) -> CalibrationStd:
         """Return the stated standard uncertainties of camera, sheet and window."""
-        camera = _select_numbers(self.figures("camera").get("std"))
+        camera = numbers_in(self.figures("camera").get("std"))
         focal = camera.pop("f", None)
         known: Table = {f"{name}_px": camera.pop(name, focal) for name in ("fx", "fy")}
         known |= {f"{name}_px": camera.pop(name, None) for name in ("cx", "cy")}
         others = {
             "distortion": camera,
             "sheet_normal_deg": self._sheet_normal_std_deg(),
-            "window_distance_mm": _select_numbers(self.figures("window")).get("std_mm"),
+            "window_distance_mm": numbers_in(self.figures("window")).get("std_mm"),
         }
         return CalibrationStd.model_validate(known | others)
 
@@ -281,7 +272,7 @@ class Calibration(Brief, Description):
         """Return the largest standard uncertainty of the direction of the sheet's normal, deg."""
         turns = SheetParameter.TURN_FAN, SheetParameter.TURN_AXIS  # about two orthogonal axes in the sheet
         if self.joint is None or not set(turns) <= set(self.joint.parameters):
-            return _select_numbers(self.figures("sheet")).get("normal_std_deg")
+            return numbers_in(self.figures("sheet")).get("normal_std_deg")
         places = [self.joint.parameters.index(turn) for turn in turns]
         covariance = self.joint.covariance_matrix()[np.ix_(places, places)]
         return float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance)[-1])))
@@ -315,3 +306,94 @@ class Calibration(Brief, Description):
     def object_transform(self) -> np.ndarray:
         """Return ``T_camera_object`` as an array (4, 4)."""
         return np.array(self.camera_from_object)
+
+
+class PolynomialCalibration(Brief, Description):
+    """Sensor calibrated by polynomials for each line: stripe position to Z, and Z to Y (thesis section 4.7).
+
+    The calibration is valid only in its own medium, with the same window, and within the range of its evidence.
+
+    Both Legendre polynomials of a line have the degree ``degree``. ``depth_coefficients`` (Z of position) and
+    ``along_coefficients`` (Y of Z) have one row of coefficients in mm for each line; the first row belongs to
+    ``first_line``. In all lines, the arguments -1 to 1 correspond to ``position_range_px`` (stripe position) and
+    ``depth_range_mm`` (Z in the OCS). ``domains_px`` is the calibrated range of stripe positions of each line, None for
+    a line without calibration.
+    """
+
+    sensor_name: str
+    stripe_along: Literal["width", "height"]
+    wavelength_nm: Positive
+    medium_name: str
+    medium: Medium
+    window_mounted: bool
+    width_px: Annotated[int, Field(gt=0)]
+    height_px: Annotated[int, Field(gt=0)]
+    degree: Annotated[int, Field(ge=1)]
+    first_line: Annotated[int, Field(ge=0)]
+    position_range_px: _Pair
+    depth_range_mm: _Pair
+    domains_px: tuple[_Pair | None, ...]
+    depth_coefficients: Rows
+    along_coefficients: Rows
+    residuals: Residuals = {}
+    provenance: Table = {}
+
+    @property
+    def joint(self) -> None:
+        """Always None: polynomials come without a joint estimate."""
+
+    @model_validator(mode="after")
+    def _check_consistency(self) -> "PolynomialCalibration":
+        count, lines = len(self.domains_px), self.width_px if self.stripe_along == "width" else self.height_px
+        if not 0 < count <= lines - self.first_line:
+            raise ValueError(f"{count} lines from line {self.first_line} on do not fit an image of {lines} lines")
+        for name in ("depth_coefficients", "along_coefficients"):
+            if [*map(len, getattr(self, name))] != [self.degree + 1] * count:
+                expected = f"{count} rows of {self.degree + 1} numbers"
+                raise ValueError(f"{name} must have {expected}, as domains_px and degree")
+        for name in ("position_range_px", "depth_range_mm"):
+            low, high = getattr(self, name)
+            if not low < high:
+                raise ValueError(f"{name} must increase; found {low:g} to {high:g}")
+        low, high = self.position_range_px
+        known = [domain for domain in self.domains_px if domain is not None]
+        if not known or not all(low <= a <= b <= high for a, b in known):
+            raise ValueError("domains_px must have increasing ranges within position_range_px")
+        return self
+
+    @check_arguments
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the calibration as JSON, completely or not at all; OutputError if that fails."""
+        # One line for each key; with indentation, each of thousands of coefficients would take a line.
+        require_ending(Path(path), (".json",))
+        content = add_seal({"format": POLYNOMIALS_FORMAT, "version": VERSION} | self.model_dump(mode="json"))
+        lines = ",\n".join(f"  {json.dumps(key)}: {json.dumps(value)}" for key, value in content.items())
+        with write_atomically(path, overwrite=overwrite) as aside:
+            aside.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
+
+    def figures(self, step: str) -> Table:
+        """Return the figures of a calibration step; an empty table if there are none."""
+        return self.residuals.get(step, {})
+
+    def medium_index(self, medium: Medium) -> float:
+        """Return the index of a medium at the laser's wavelength, relative to air; RangeError outside the formula."""
+        return medium.refractive_index(self.wavelength_nm)
+
+    def domains(self) -> np.ndarray:
+        """Return ``domains_px`` as an array (L, 2) with NaN for None."""
+        return np.array([(np.nan, np.nan) if domain is None else domain for domain in self.domains_px])
+
+
+AnyCalibration = Calibration | PolynomialCalibration
+
+
+def calibration_digest(calibration: AnyCalibration) -> str:
+    """Return the short digest that identifies a calibration in clouds."""
+    if (digest := _digests.get(id(calibration))) is None:
+        digest = hashlib.sha256(calibration.model_dump_json().encode()).hexdigest()[:16]
+        _digests[id(calibration)] = digest
+        weakref.finalize(calibration, _digests.pop, id(calibration), None).atexit = False
+    return digest
+
+
+_digests: dict[int, str] = {}  # digests of calibrations in use, by `id`

@@ -257,20 +257,11 @@ WATERS = {
 """All named waters. Petzold's: absorption and scattering in 1/m including sea water; Jerlov's: column of the tables."""
 
 
-def find_water(name: str) -> NaturalWater:
-    """Return a water by name; DescriptionError with the known names."""
-    if name not in WATERS:
-        raise DescriptionError(f"unknown water '{name}'; known are {', '.join(WATERS)}")
-    return WATERS[name]
-
-
 def particles_at(turbidity: float, *, wavelength_nm: float) -> Particles:
     """Return the particles of water with a turbidity: 0 is "pure", 1 "clear", 2 "coastal", 3 "harbour".
 
-    The interpolation is linear between 0 and 1, and geometric above 1. Raises RangeError if the turbidity is outside
-    0 to 3, or the wavelength outside 400-700 nm.
+    The interpolation is linear between 0 and 1, and geometric above 1. Raises RangeError outside 400-700 nm.
     """
-    check_range("turbidity", turbidity, 0.0, 3.0, "the scale from pure water to a harbour's")
     clear, coastal, harbour = (WATERS[name].particles(wavelength_nm) for name in ("clear", "coastal", "harbour"))
     if turbidity <= 1:
         return Particles(turbidity * clear.absorption_per_m, turbidity * clear.scattering_per_m)

@@ -8,8 +8,7 @@ from pydantic import Field, model_validator
 
 from uwlts.argument_types import check_arguments
 from uwlts.files.json_files import write_model
-from uwlts.model.calibration import is_rigid
-from uwlts.model.sensor import Description, NotNegative, Positive, Rows, Vector
+from uwlts.model.sensor import Description, NotNegative, Positive, RigidTransform, Rows, Vector
 from uwlts.model.short_text import Brief
 
 FORMAT, VERSION = "uwlts-mount", 1
@@ -96,7 +95,7 @@ class Mount(Brief, Description):
     ``inputs`` holds the SHA-256 of every input file. ``edited`` is set if its file was edited by hand.
     """
 
-    T_platform_sensor: Rows
+    T_platform_sensor: RigidTransform
     covariance: Rows
     coverage_factor: Positive
     artefact: Annotated[SphereFound | PlaneFound | BoardFound, Field(discriminator="kind")]
@@ -118,8 +117,6 @@ class Mount(Brief, Description):
 
     @model_validator(mode="after")
     def _check_consistency(self) -> "Mount":
-        if [*map(len, self.T_platform_sensor)] != [4] * 4 or not is_rigid(self.transform(), within=1e-6):
-            raise ValueError("T_platform_sensor must be a rigid 4x4 matrix")
         covariance = np.array(self.covariance) if [*map(len, self.covariance)] == [6] * 6 else np.full((6, 6), np.nan)
         if not np.abs(covariance - covariance.T).max() <= 1e-9 * np.abs(covariance).max():
             raise ValueError("covariance must be a symmetric 6x6 matrix")

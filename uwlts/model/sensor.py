@@ -45,15 +45,24 @@ def _check_unit(vector: Vector) -> Vector:
 Rows = tuple[tuple[float, ...], ...]
 
 
-def _check_mounting(rows: Rows) -> Rows:
-    matrix = np.array(rows) if [*map(len, rows)] == [4] * 4 else np.zeros((4, 4))
-    rotation = matrix[:3, :3]
-    square = rotation @ rotation.T
-    if not (np.allclose(square, np.eye(3), atol=1e-6) and np.linalg.det(rotation) > 0 and matrix[3, 3] == 1):
-        raise ValueError("must be a 4x4 rigid transform: rotation, translation, and last row 0 0 0 1")
-    return rows
+def is_rigid(matrices: np.ndarray, *, within: float) -> bool:
+    """Return whether matrices (..., 4, 4) are rigid transforms without reflection; ``within`` is the tolerance."""
+    rotation = matrices[..., :3, :3]
+    if not (np.abs(rotation) < 2).all() or not np.isfinite(matrices).all():
+        return False
+    square = np.allclose(rotation @ np.swapaxes(rotation, -1, -2), np.eye(3), atol=within)
+    last = np.allclose(matrices[..., 3, :], (0, 0, 0, 1), atol=within)
+    return square and last and bool((np.linalg.det(rotation) > 0).all())
 
 
+def _check_rigid(rows: Rows) -> Rows:
+    """Raise ValueError unless the rows are a rigid transform (4, 4) to 1e-6 (text may be rounded)."""
+    if [*map(len, rows)] == [4] * 4 and is_rigid(np.array(rows), within=1e-6):
+        return rows
+    raise ValueError("must be a 4x4 rigid transform: rotation, translation, and last row 0 0 0 1")
+
+
+RigidTransform = Annotated[Rows, AfterValidator(_check_rigid)]
 UnitVector = Annotated[Vector, AfterValidator(_check_unit)]
 
 _INDEX_FORMULA = 1.5e-5  # uncertainty of the formula for the index of water, as stated by Quan and Fry (1995)
@@ -413,7 +422,7 @@ class Medium(Description):
     def _particles(self, wavelength_nm: float) -> media.Particles:
         if self.turbidity is not None:
             return media.particles_at(self.turbidity, wavelength_nm=wavelength_nm)
-        return media.find_water(self.water or "pure").particles(wavelength_nm)
+        return media.WATERS[self.water or "pure"].particles(wavelength_nm)
 
     def _phase_function(self) -> phase_functions.PhaseFunction:
         if isinstance(self.phase, phase_functions.DescribedPhase):
@@ -421,7 +430,7 @@ class Medium(Description):
         # The turbidity scale interpolates between Petzold's stations.
         name = self.phase or ("molecular" if self.turbidity is None else "petzold")
         if self.phase is None and self.water is not None:
-            name = media.find_water(self.water).phase
+            name = media.WATERS[self.water].phase
         parameters = {"asymmetry", "particle_index", "particle_slope", "backscatter_share"}
         keys = self.model_dump(include=parameters, exclude_none=True)
         return phase_functions.phase_function_kind(name).of_keys(keys)
@@ -679,5 +688,5 @@ class CaptureHeader(Description):
     saturation_dn: Annotated[int, Field(gt=0)]
     target: Table | None = None
     artefact: Table | None = None
-    T_platform_sensor: Annotated[Rows, AfterValidator(_check_mounting)] | None = None
+    T_platform_sensor: RigidTransform | None = None
     provenance: Table = {}

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from uwlts.argument_types import check_arguments
 from uwlts.errors import DescriptionError
 from uwlts.files.writing import require_ending, write_atomically
-from uwlts.model.calibration import is_rigid
+from uwlts.model.sensor import is_rigid
 from uwlts.model.short_text import Brief
 
 _ROUNDED = 1e-6  # deviation of poses and correlations that files with six digits have

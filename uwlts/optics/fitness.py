@@ -1,10 +1,8 @@
 """Check of a calibration against a recording: image size and place, stripe, wavelength, lens, medium and window."""
 
 from uwlts.errors import CalibrationError
-from uwlts.model.any_calibration import AnyCalibration
-from uwlts.model.calibration import Calibration
+from uwlts.model.calibration import AnyCalibration, Calibration, PolynomialCalibration
 from uwlts.model.joint_estimate import Origin
-from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.model.sensor import Camera, CaptureHeader
 
 _LARGEST_INDEX_CHANGE = 1e-3

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from uwlts.errors import RangeError
-from uwlts.model.calibration import Calibration, FanModel, SheetModel
-from uwlts.model.polynomial_calibration import PolynomialCalibration
+from uwlts.model.calibration import Calibration, FanModel, PolynomialCalibration, SheetModel
 from uwlts.model.stripe import stack_pixels
 from uwlts.optics.camera import directions
 from uwlts.optics.line_table import LineTable

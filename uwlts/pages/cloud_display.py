@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from uwlts.pages.cloud_figure import LIMIT_STD, PARTS, CloudField, CloudPoints, colour_limit_mm
-from uwlts.pages.toolkit import FigureCollector, render_page, unit_for, write_page
+from uwlts.pages.cloud_figure import LIMIT_STD, PARTS, CloudField, CloudPoints, scale_values
+from uwlts.pages.toolkit import FigureCollector, render_page, write_page
 
 MOST_SHOWN = 200_000
 """Largest number of points in a view of its own: about 1 MB, which every browser turns without delay."""
@@ -34,15 +34,10 @@ def choose_points(
     if field == "depth":
         return CloudPoints(points_mm[chosen], field, None, "mm", None), f"{caption} {axes}"
     values = np.full(count, np.nan) if values is None else values.astype(np.float64)
-    unit, factor, limit = "grey values", 1.0, None
-    if field != "intensity":
-        known = np.abs(values[np.isfinite(values)])
-        limit = colour_limit_mm(values) if field == "deviation" else None
-        unit, factor = unit_for(limit or float(np.median(known) if len(known) else 1.0))
+    values, unit, limit = scale_values(values, field)
     if limit is not None:
-        limit *= factor
         caption += f" The colours end at {LIMIT_STD:g} standard deviations, ±{limit:.3g} {unit}."
-    if np.isnan(shown := factor * values[chosen]).any():
+    if np.isnan(shown := values[chosen]).any():
         caption += " Dark points were not evaluated: outliers, near an edge, or beside the artefact." if limit else ""
     caption += f" {PARTS[field]}" if field in PARTS else ""
     return CloudPoints(points_mm[chosen], field, shown, unit, limit), f"{caption} {axes}"
@@ -66,7 +61,7 @@ def display_points(points_mm: np.ndarray, field: CloudField, values: np.ndarray 
     """Return the view of points (N, 3) in the OCS, mm, coloured by values; see `choose_points`."""
     figures = FigureCollector()
     points, caption = choose_points(points_mm, field, values, most=MOST_SHOWN)
-    view = figures.add_cloud(points, caption, still="")
+    view = figures.add_cloud(points, caption)
     return CloudDisplay(render_page("uwlts.pages", "cloud_display.html.j2", interactive=figures, view=view))
 
 

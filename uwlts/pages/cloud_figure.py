@@ -64,6 +64,20 @@ def colour_limit_mm(deviation_mm: np.ndarray) -> float:
     return max(LIMIT_STD * float(finite.std()), 1e-9) if len(finite) else 1e-9
 
 
+def scale_values(values: np.ndarray, field: CloudField) -> tuple[np.ndarray, str, float | None]:
+    """Return values (N,) of a quantity, in mm or grey values, in the unit in which they are drawn, and this unit.
+
+    Lengths of a fraction of a millimetre are in µm. The last number is the end of the colours for a deviation.
+    """
+    if field in ("depth", "intensity"):
+        return values, "mm" if field == "depth" else "grey values", None
+    known = np.abs(values[np.isfinite(values)])
+    limit = colour_limit_mm(values) if field == "deviation" else None
+    spread = limit or (float(np.median(known)) if len(known) else 1.0)
+    unit, factor = ("µm", 1e3) if spread < 0.5 else ("mm", 1.0)
+    return factor * values, unit, None if limit is None else factor * limit
+
+
 @dataclass(frozen=True, eq=False)
 class CloudPoints:
     """Points for a view of a page, seen along `view_direction`."""

@@ -1,9 +1,8 @@
 """Templates, style, figures, numbers and files shared by all HTML pages.
 
-A page is a Jinja template that extends ``base.html.j2`` and imports what it needs from ``components.html.j2``::
+A page is a Jinja template that extends ``base.html.j2`` and uses the macros of ``components.html.j2``::
 
     {% extends "base.html.j2" %}
-    {% from "components.html.j2" import tiles, facts, table, picture, chart %}
     {% block title %}Measurement report{% endblock %}
     {% block content %}{{ tiles(key_figures) }} ... {{ chart(cloud) }}{% endblock %}
 
@@ -21,20 +20,24 @@ from __future__ import annotations
 import base64
 import io
 import math
+import os
 import re
+import shutil
+import subprocess
 import sys
+import tempfile
 import warnings
-from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeGuard
+from typing import TYPE_CHECKING, Any, Literal
 
 from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup
 
 from uwlts._version import __version__
+from uwlts.errors import SetupError
 from uwlts.files.writing import refuse_unsuitable, write_atomically
 from uwlts.pages.cloud_figure import CloudPoints, view_scripts
 
@@ -44,13 +47,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
     Drawn = Figure | SubFigure | Axes
-
-import os
-import shutil
-import subprocess
-import tempfile
-
-from uwlts.errors import SetupError
 
 MISSING = "-"  # placeholder for a missing value in tables of text
 
@@ -92,6 +88,8 @@ def render_page(package: str, template: str, /, *, interactive: FigureCollector 
     loader = FileSystemLoader([own, own / "templates", templates])
     environment = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters["minus"] = typeset_number
+    components = environment.get_template("components.html.j2").module
+    environment.globals.update({name: part for name, part in vars(components).items() if not name.startswith("_")})
     collected = FigureCollector() if interactive is None else interactive
     scripts, clouds, plotly = collected.scripts, collected.clouds, ""
     if scripts:
@@ -157,20 +155,11 @@ def refuse_unsuitable_page(page: Path, *, kind: str = "", pdf: bool = False, ove
 
 @dataclass(frozen=True)
 class InteractiveFigure:
-    """Position of an interactive figure in a page."""
+    """Position of an interactive figure or cloud in a page; a figure has a height in px."""
 
     number: int
     caption: str
-    height: int
-
-
-@dataclass(frozen=True)
-class InteractiveCloud:
-    """Position of an interactive cloud in a page; ``still`` is the address of a picture for print, if any."""
-
-    number: int
-    caption: str
-    still: str
+    height: int = 0
 
 
 class FigureCollector:
@@ -185,10 +174,10 @@ class FigureCollector:
         self.scripts.append(_script_json(figure.to_json(validate=False) or ""))
         return InteractiveFigure(len(self.scripts) - 1, caption, int(figure.layout.height))
 
-    def add_cloud(self, points: CloudPoints, caption: str, *, still: str) -> InteractiveCloud:
-        """Add a cloud and the address of its picture."""
+    def add_cloud(self, points: CloudPoints, caption: str) -> InteractiveFigure:
+        """Add a cloud."""
         self.clouds.append(_script_json(points.to_json()))
-        return InteractiveCloud(len(self.clouds) - 1, caption, still)
+        return InteractiveFigure(len(self.clouds) - 1, caption)
 
 
 def _script_json(text: str) -> Markup:
@@ -224,25 +213,17 @@ def make_figure(
 
 
 def new_figure(
-    width: float = 5.6,
-    height: float = 3.2,
-    *,
-    rows: int = 1,
-    columns: int = 1,
-    height_ratios: list[float] | None = None,
-    width_ratios: list[float] | None = None,
-    shown: bool = False,
+    width: float = 5.6, height: float = 3.2, *, rows: int = 1, columns: int = 1, shown: bool = False
 ) -> tuple[Figure, list[Axes]]:
-    """Return a matplotlib figure in the pages' style, and its axes row by row.
+    """Return a matplotlib figure in the pages' style, of a size in inches, and its axes row by row.
 
-    Sizes are in inches, ratios relative heights of rows and widths of columns. ``shown``: `pyplot.show` and notebooks
-    show the figure.
+    ``shown``: `pyplot.show` and notebooks show the figure.
     """
     import matplotlib
 
     figure = make_figure(width, height, shown=shown)
     with matplotlib.rc_context(_STYLE):
-        axes = figure.subplots(rows, columns, squeeze=False, height_ratios=height_ratios, width_ratios=width_ratios)
+        axes = figure.subplots(rows, columns, squeeze=False)
         return figure, list(axes.flat)
 
 
@@ -361,9 +342,6 @@ def find_browser() -> str:
     )
 
 
-_UNITS = {"px": "px", "mm": "mm", "deg": "°", "rad": "rad", "nm": "nm"}
-
-
 def format_fixed(value: float | None, decimals: int = 3, *, signed: bool = False) -> str:
     """Format a number with fixed decimals; a number that rounds to zero has no sign."""
     if value is None or not math.isfinite(value):
@@ -376,43 +354,3 @@ def format_to_scale(value: float, scale: float, *, digits: int = 3) -> str:
     """Format a number with as many decimals as a scale with some significant digits has."""
     decimals = digits - 1 - math.floor(math.log10(scale)) if scale > 0 else 3
     return format_fixed(value, max(0, decimals))
-
-
-def unit_of(name: str) -> str:
-    """Return the unit at the end of a name, as in ``rms_px``; empty for a pure number."""
-    return _UNITS.get(name.rsplit("_", 1)[-1], "") if "_" in name else ""
-
-
-def split_name(name: str) -> str:
-    """Return a name as words, without its unit."""
-    bare = name.rsplit("_", 1)[0] if unit_of(name) else name
-    return re.sub(r"_+", " ", bare)
-
-
-def is_number(value: Any) -> TypeGuard[float]:
-    """Return whether a value from JSON is a finite number."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def number_list(value: Any) -> list[float | None] | None:
-    """Return a list from JSON if it contains only finite numbers and None, else None."""
-    return value if isinstance(value, list) and all(each is None or is_number(each) for each in value) else None
-
-
-def numbers_in(table: Any) -> dict[str, float]:
-    """Return the finite numbers in a table from JSON by name; empty if the value is not a table."""
-    return {name: value for name, value in table.items() if is_number(value)} if isinstance(table, dict) else {}
-
-
-def entries_of(table: Mapping[str, Any], group: str = "") -> Iterator[tuple[str, str, Any]]:
-    """Iterate over group, name and value of the entries of nested tables; a group is the names of its tables."""
-    for name, value in table.items():
-        if isinstance(value, dict):
-            yield from entries_of(value, f"{group} {name}".strip())
-        else:
-            yield group, name, value
-
-
-def unit_for(spread_mm: float) -> tuple[str, float]:
-    """Return the unit for drawing deviations of this spread, and its number per millimetre."""
-    return ("µm", 1e3) if spread_mm < 0.5 else ("mm", 1.0)

@@ -23,8 +23,7 @@ from uwlts.errors import CaptureError, DescriptionError, RangeError
 from uwlts.fitting.propagation import jackknife
 from uwlts.model.sensor import Table
 from uwlts.model.short_text import Brief, align_columns
-from uwlts.radiometry.image_sets import open_image_set
-from uwlts.radiometry.stripe_windows import STATISTICS, WINDOW_LINES, StripeWindows, measure_windows
+from uwlts.radiometry.stripe_windows import STATISTICS, WINDOW_LINES, StripeWindows, measure_windows, open_image_set
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.stripe import StripeSettings
 
@@ -213,13 +212,17 @@ def _set_gap(own: StripeWindows, real: StripeWindows) -> SetGap:
     low, high = np.quantile(own.values, _COVERED, axis=0)
     inside = (real.values >= low) & (real.values <= high)
     names = [each.name for each in STATISTICS]
-    single = [_GroupedDistances.between(p[:, [k]], x, q[:, [k]], y).coefficient() for k in range(len(names))]
-    whole = _GroupedDistances.between(p, x, q, y)
+    values, starts = np.vstack([p, q]), np.append(_group_starts(x.image), len(p) + _group_starts(y.image))
+    first, second = np.split(np.arange(len(starts)), [np.searchsorted(starts, len(p))])
+    single = [_GroupDistances.between(column[:, None], starts).coefficient(first, second) for column in values.T]
+    whole = _GroupDistances.between(values, starts)
+    left = [[whole.coefficient(first[first != group], second) for group in first]]
+    left.append([whole.coefficient(first, second[second != group]) for group in second])
     return SetGap(
         own.name,
         real.name,
-        whole.coefficient(),
-        whole.std(),
+        whole.coefficient(first, second),
+        math.sqrt(sum(float(jackknife((np.array(each) - np.mean(each))[:, None])[0, 0]) for each in left)),
         dict(zip(names, single, strict=True)),
         dict(zip(names, inside.mean(axis=0).tolist(), strict=True)),
         float(inside.all(axis=1).mean()),
@@ -230,10 +233,10 @@ def _floor(real: StripeWindows) -> GapFloor:
     """Return the gap between random halves of the images of a real set, or of its parts if it has few images."""
     own, rng = _thinned(real), np.random.default_rng(0)
     values = _to_quantiles(own.values, own.values)[0]
-    whole = _GroupedDistances.between(values, own, values, own)
-    count = len(whole.first_count)
+    whole = _GroupDistances.between(values, _group_starts(own.image))
+    count = len(whole.count)
     halves = [rng.permutation(count) for _ in range(_HALVINGS)]
-    gaps = [whole.select(each[: count // 2], each[count // 2 :]).coefficient() for each in halves]
+    gaps = [whole.coefficient(each[: count // 2], each[count // 2 :]) for each in halves]
     return GapFloor(real.name, float(np.mean(gaps)), float(np.std(gaps)))
 
 
@@ -260,54 +263,27 @@ def _to_quantiles(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
-class _GroupedDistances:
-    """Sums of distances between windows of groups: within two sets, and from one to the other.
+class _GroupDistances:
+    """Sums (G, G) of the distances between all windows of two groups, with numbers (G,) of their windows.
 
-    Groups are images, or parts of successive windows. ``first`` (G, G), ``second`` (H, H) and ``across`` (G, H) are
-    sums over all pairs of windows of two groups, with ``first_count`` (G,) and ``second_count`` (H,) windows.
+    Groups are images, or parts of successive windows.
     """
 
-    first: np.ndarray
-    second: np.ndarray
-    across: np.ndarray
-    first_count: np.ndarray
-    second_count: np.ndarray
+    sums: np.ndarray
+    count: np.ndarray
 
     @classmethod
-    def between(cls, p: np.ndarray, x: StripeWindows, q: np.ndarray, y: StripeWindows) -> _GroupedDistances:
-        """Sum the distances of standardised statistics (N, K) and (M, K) of two sets."""
-        rows, columns = _group_starts(x.image), _group_starts(y.image)
+    def between(cls, values: np.ndarray, starts: np.ndarray) -> _GroupDistances:
+        """Sum the distances of windows with statistics (N, K); ``starts`` (G,) are the first windows of groups."""
+        by_group = np.add.reduceat(cdist(values, values), starts, axis=0)
+        return cls(np.add.reduceat(by_group, starts, axis=1), np.diff(starts, append=len(values)))
 
-        def sums(one: np.ndarray, other: np.ndarray, by: np.ndarray, to: np.ndarray) -> np.ndarray:
-            return np.add.reduceat(np.add.reduceat(cdist(one, other), by, axis=0), to, axis=1)
-
-        counts = np.diff(rows, append=len(p)), np.diff(columns, append=len(q))
-        return cls(sums(p, p, rows, rows), sums(q, q, columns, columns), sums(p, q, rows, columns), *counts)
-
-    def select(self, some: np.ndarray, others: np.ndarray) -> _GroupedDistances:
-        """Return the distances of some groups of the first set and of other groups of the second one."""
-        return _GroupedDistances(
-            self.first[np.ix_(some, some)],
-            self.second[np.ix_(others, others)],
-            self.across[np.ix_(some, others)],
-            self.first_count[some],
-            self.second_count[others],
-        )
-
-    def coefficient(self) -> float:
-        """Return the energy coefficient of inhomogeneity."""
-        n, m = int(self.first_count.sum()), int(self.second_count.sum())
-        within = self.first.sum() / (n * (n - 1)) + self.second.sum() / (m * (m - 1))
-        between = 2 * self.across.sum() / (n * m)
+    def coefficient(self, some: np.ndarray, others: np.ndarray) -> float:
+        """Return the energy coefficient of inhomogeneity of some groups and of other ones, given by their numbers."""
+        n, m = (int(self.count[groups].sum()) for groups in (some, others))
+        within = sum(self.sums[np.ix_(g, g)].sum() / (k * (k - 1)) for g, k in ((some, n), (others, m)))
+        between = 2 * self.sums[np.ix_(some, others)].sum() / (n * m)
         return float((between - within) / between) if between > 0 else 0.0
-
-    def std(self) -> float:
-        """Return the standard uncertainty of the coefficient by the jackknife over the groups of both sets."""
-        every = np.arange(len(self.first_count)), np.arange(len(self.second_count))
-        first = np.array([self.select(np.delete(every[0], g), every[1]).coefficient() for g in every[0]])
-        second = np.array([self.select(every[0], np.delete(every[1], g)).coefficient() for g in every[1]])
-        variances = [float(jackknife((left - left.mean())[:, None])[0, 0]) for left in (first, second)]
-        return math.sqrt(sum(variances))
 
 
 def _group_starts(image: np.ndarray) -> np.ndarray:

@@ -18,15 +18,13 @@ from uwlts.errors import CalibrationError, CaptureError, DescriptionError
 from uwlts.files.reading import log_warnings
 from uwlts.fitting.least_squares import robust_std
 from uwlts.fitting.propagation import jackknife
-from uwlts.model.any_calibration import calibration_digest
-from uwlts.model.calibration import Calibration
+from uwlts.model.calibration import Calibration, calibration_digest
 from uwlts.model.media import water_absorption_per_m
 from uwlts.model.phase_functions import FournierForand, HenyeyGreenstein, PetzoldAverage, PhaseFunction
 from uwlts.model.sensor import CaptureHeader
 from uwlts.optics.fitness import check_fits
-from uwlts.radiometry.followed_sensor import follow_sensor
+from uwlts.radiometry.followed_sensor import follow_sensor, outlook
 from uwlts.radiometry.result import ImageEstimate, PartFit, Radiometry
-from uwlts.radiometry.scattering import STEP_PX, HaloKernel
 from uwlts.radiometry.stripe_images import (
     BLOCKS,
     GROUP_LINES,
@@ -38,8 +36,7 @@ from uwlts.radiometry.stripe_images import (
     measure_noise,
     measure_stripes,
 )
-from uwlts.radiometry.stripe_light import StripeLight, defocus_variance, stripe_light
-from uwlts.radiometry.water_outlook import outlook
+from uwlts.radiometry.stripe_light import STEP_PX, HaloKernel, StripeLight, defocus_variance, stripe_light
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.calibration_file import resolve_calibration
 from uwlts.storage.capture import NO_STAGE, Capture, describe_source, open_capture
@@ -247,7 +244,6 @@ class _Evidence:
     distance_mm: float
     path_mm: float
     dark_e: float
-    nodes: np.ndarray
     tails: CubicSpline
     within: CubicSpline
 
@@ -262,16 +258,12 @@ class _Evidence:
     ) -> _Evidence:
         """Average the geometry over groups, and tabulate the halo of every block over the scattering coefficient."""
         held = images.of_group >= 0
-        group, count = images.of_group[held], len(images.light)
-        number = np.bincount(group, minlength=count)
 
         def mean(values: np.ndarray) -> np.ndarray:
-            return np.bincount(group, values[held], count) / number
-
-        block, size = images.block, np.bincount(images.block)
+            return _mean_of(images.of_group[held], values[held])
 
         def mean_of_block(values: np.ndarray) -> np.ndarray:
-            return np.bincount(block, values) / size
+            return _mean_of(images.block, values)
 
         sheet, ray = mean(light.sheet_per_px), mean(light.ray_per_px)
         to_laser, to_camera = mean(light.laser_path_mm), mean(light.camera_path_mm)
@@ -280,15 +272,13 @@ class _Evidence:
         sheet_of_block = mean_of_block(sheet)
         nodes = np.concatenate([[0.0], np.geomspace(1e-2, _MOST_SCATTERING_PER_M, _SCATTERING_NODES - 1)])
         core = images.width // 2
-        sigma = np.full(BLOCKS, 1.0)
         tails, within = [], []
-        for j, (own, seen, first, second) in enumerate(
-            zip(sheet_of_block, *map(mean_of_block, (ray, to_laser, to_camera)), strict=True)
-        ):
+        of_block = map(mean_of_block, (ray, to_laser, to_camera))
+        for own, seen, first, second in zip(sheet_of_block, *of_block, strict=True):
             kernel = HaloKernel(phase.per_sr, ((first, own), (second, seen)))
             middle = int(np.argmin(np.abs(kernel.place_px)))
             step = round(1 / STEP_PX)
-            rows = [kernel.profile(1e-3 * b, sigma_px=sigma[j]) for b in nodes]
+            rows = [kernel.profile(1e-3 * b, sigma_px=1.0) for b in nodes]
             tails.append([row[middle + step :: step][:TAIL_PX] for row in rows])
             reach = round((core + 0.5) / STEP_PX)
             within.append([STEP_PX * row[middle - reach : middle + reach + 1].sum() for row in rows])
@@ -306,7 +296,6 @@ class _Evidence:
             * float(np.median(images.exposure_ms))
             * detector.dark_current_e_per_s
             * detector.dark_current_growth(),
-            nodes=nodes,
             tails=CubicSpline(nodes, np.array(tails), axis=1),
             within=CubicSpline(nodes, np.array(within), axis=1),
         )
@@ -391,7 +380,7 @@ class _Evidence:
     def _halo(self, scattering: float, background: float) -> np.ndarray:
         """Return the grey values (BLOCKS, TAIL_PX) of the halo."""
         images = self.images
-        light = np.bincount(images.block, images.light - images.width * background) / np.bincount(images.block)
+        light = _mean_of(images.block, images.light - images.width * background)
         return self.tails(scattering) * (light / self.within(scattering))[:, None]
 
     def _fit_tail(self, kept: np.ndarray, background: float, first_px: int) -> tuple[float, float]:
@@ -420,7 +409,7 @@ class _Evidence:
         rest = _fit_robustly(*self._brightness(*fitted))[1]
         # A pattern along the fan is the laser's: it repeats in all images.
         cell = np.argsort(np.argsort(self.fan)) // BLOCKS
-        scatter = robust_std(rest - (np.bincount(cell, rest) / np.bincount(cell))[cell])
+        scatter = robust_std(rest - _mean_of(cell, rest)[cell])
         grain = value["grain_contrast"] * math.sqrt(value["grain_length_lines"] / GROUP_LINES)
         first = max(self.images.width // 2, TAIL_FIRST_PX)
         halo = self._halo(*fitted)[:, first:]
@@ -460,6 +449,11 @@ class _Evidence:
                 ("power_reflectance_mw", "attenuation_per_m", "scattering_per_m", "background_dn"),
             ),
         )
+
+
+def _mean_of(group: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the mean (G,) of the values (N,) of each group; ``group`` (N,) numbers those of the values."""
+    return np.bincount(group, values) / np.bincount(group)
 
 
 def _described_phase(header: CaptureHeader) -> PhaseFunction:

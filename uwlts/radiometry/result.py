@@ -176,7 +176,7 @@ class Radiometry(Brief):
             *(each.line() for each in (*self.estimates, *self.parts)),
             *(f"not separable: {text}" for text in self.not_separable),
         ]
-        table = _without_none(self.sensor.model_dump(mode="json"))
+        table = self.sensor.model_dump(mode="json", exclude_none=True)  # TOML cannot express None
         text = "".join(f"# {line}\n" for line in head) + "\n" + tomli_w.dumps(table)
         with (
             write_atomically(Path(path).with_suffix(".json"), overwrite=overwrite) as record,
@@ -192,10 +192,3 @@ def format_value(value: float, std: float) -> str:
         return f"{value:.4g}"
     digits = max(0, 1 - math.floor(math.log10(std)))
     return f"{value:.{digits}f} ± {std:.{digits}f}"
-
-
-def _without_none(content: Any) -> Any:
-    """Return a table without its empty entries, which TOML cannot express."""
-    if isinstance(content, dict):
-        return {key: _without_none(value) for key, value in content.items() if value is not None}
-    return [_without_none(value) for value in content] if isinstance(content, list) else content

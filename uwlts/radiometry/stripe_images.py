@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -36,7 +36,7 @@ GROUP_LINES = 16
 """Lines whose light is added: many grains, so that the bias of the logarithm of the sum is negligible."""
 BLOCKS = 20
 """Blocks of consecutive groups for the jackknife: a standard uncertainty is then known to a sixth."""
-_CLIPPED = 0.98
+CLIPPED = 0.98
 """Fraction of full scale above which a pixel may be clipped."""
 _MOST_CLIPPED = 0.02
 """Largest fraction of lines with clipped pixels in a run; their light is too low by about a tenth."""
@@ -124,8 +124,8 @@ def measure_stripes(
         profiles = (image if along == "height" else image.T).astype(np.float32)
         for run in _runs(line, usable[own]):
             chosen = own[run]
-            part = _measure_run(profiles, stripes.line[chosen], stripes.centre_px[chosen], core, _CLIPPED * full_dn)
-            peaks.append(part.values[:, part.middle])
+            part = _measure_run(profiles, stripes.line[chosen], stripes.centre_px[chosen], core, CLIPPED * full_dn)
+            peaks.append(part.values[:, TAIL_PX])
             if np.mean(part.clipped) > _MOST_CLIPPED:
                 clipped += len(run)
                 continue
@@ -136,7 +136,7 @@ def measure_stripes(
                 of_group[chosen[kept]] = len(light)
                 light.append(float(part.light[kept].mean()))
                 exposure.append(float(capture.exposure_ms[frame]))
-                parts.append(part.select(kept))
+                parts.append(_Part(*(column[kept] for column in part)))
         progress(number + 1, len(frames), "brightness of the stripe")
     if len(light) < BLOCKS:
         share = clipped / max(len(stripes.line), 1)
@@ -149,7 +149,10 @@ def measure_stripes(
             f"saturated pieces of the stripe: {advice}"
         )
     block = np.arange(len(light)) * BLOCKS // len(light)
-    of_block = [_Part.join([part for part, at in zip(parts, block, strict=True) if at == j]) for j in range(BLOCKS)]
+    of_block = [
+        _Part(*map(np.concatenate, zip(*(parts[k] for k in np.flatnonzero(block == j)), strict=True)))
+        for j in range(BLOCKS)
+    ]
     edges = np.arange(-core - _FINE_PX / 2, core + _FINE_PX, _FINE_PX)
     tails = [part.tail() for part in of_block]
     return StripeImages(
@@ -167,8 +170,7 @@ def measure_stripes(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Part:
+class _Part(NamedTuple):
     """Pixels about N neighbouring centres."""
 
     values: np.ndarray  # (N, 2 TAIL_PX + 1); grey values, NaN outside the image
@@ -177,20 +179,6 @@ class _Part:
     light: np.ndarray
     deviation: np.ndarray
     clipped: np.ndarray  # (N,) bool
-    middle: int = TAIL_PX  # number of the middle pixel
-
-    def select(self, kept: np.ndarray) -> _Part:
-        """Return the pixels of some centres."""
-        columns = self.values, self.offset, self.light, self.deviation, self.clipped
-        values, offset, light, deviation, clipped = (column[kept] for column in columns)
-        return _Part(values, offset, light, deviation, clipped)
-
-    @classmethod
-    def join(cls, parts: list[_Part]) -> _Part:
-        """Join the pixels of several runs."""
-        names = "values", "offset", "light", "deviation", "clipped"
-        columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-        return cls(**columns)
 
     def mean_profile(self, edges: np.ndarray) -> np.ndarray:
         """Return the mean grey value (K,) in cells of the distance from the centre; NaN in empty cells."""
@@ -279,30 +267,31 @@ def measure_noise(source: Capture) -> CameraNoise | None:
         images = np.stack([source.image(number) for number in numbers.tolist()]).astype(np.float32)
         # Particles change the mean of a pixel, but seldom its median.
         parts.append(np.stack([np.median(images, axis=0), _still_variance(images)]))
-    if parts:
-        mean, variance = np.stack(parts, axis=1)
-        # Most pixels are dark.
-        noise_dn, background_dn = math.sqrt(float(np.nanmedian(variance))), float(np.median(mean))
-        # The means of dark pixels differ by noise alone: they are one bin.
-        dark_dn = max(6.0 * noise_dn / math.sqrt(2.0), 2.0)
-        edges = background_dn + np.concatenate([[-math.inf], np.geomspace(dark_dn, 0.85 * full_dn, _BINS)])
-        # Each part of the jackknife has a piece of the stripe: all images of some of its lines.
-        across = 1 if source.header.sensor.camera.stripe_along == "height" else 2
-        pieces = zip(*(np.array_split(each, BLOCKS, axis=across) for each in (mean, variance)), strict=True)
-        counted = np.array([_bin_variance(m.ravel(), v.ravel(), edges) for m, v in pieces])
-        whole = _fit_transfer(counted.sum(axis=0), background_dn)
-        if whole is not None:
-            left = np.array([_fit_transfer(counted.sum(axis=0) - part, background_dn) or whole for part in counted])
-            std = np.sqrt(np.diag(jackknife(left - left.mean(axis=0))))
-            # The intercept is the variance of the pixels beside the stripe, which includes the shot noise of its halo.
-            lines_last = mean if across == 2 else mean.transpose(0, 2, 1)
-            halo = whole[0] * max(background_dn - _dimmest(lines_last, background_dn + dark_dn), 0.0)
-            dark = math.sqrt(max(whole[1] - halo, 0.0))
-            variance_std = math.hypot(float(std[1]), _HALO_STD * halo)
-            freedom = float(np.mean([len(numbers) - 1 for numbers in repeated]))
-            fit = _judge_transfer(counted.sum(axis=0), background_dn, *whole, freedom)
-            return CameraNoise(whole[0], float(std[0]), dark, variance_std / max(2 * dark, 1e-3), fit)
-    return None
+    if not parts:
+        return None
+    mean, variance = np.stack(parts, axis=1)
+    # Most pixels are dark.
+    noise_dn, background_dn = math.sqrt(float(np.nanmedian(variance))), float(np.median(mean))
+    # The means of dark pixels differ by noise alone: they are one bin.
+    dark_dn = max(6.0 * noise_dn / math.sqrt(2.0), 2.0)
+    edges = background_dn + np.concatenate([[-math.inf], np.geomspace(dark_dn, 0.85 * full_dn, _BINS)])
+    # Each part of the jackknife has a piece of the stripe: all images of some of its lines.
+    across = 1 if source.header.sensor.camera.stripe_along == "height" else 2
+    pieces = zip(*(np.array_split(each, BLOCKS, axis=across) for each in (mean, variance)), strict=True)
+    counted = np.array([_bin_variance(m.ravel(), v.ravel(), edges) for m, v in pieces])
+    whole = _fit_transfer(counted.sum(axis=0), background_dn)
+    if whole is None:
+        return None
+    left = np.array([_fit_transfer(counted.sum(axis=0) - part, background_dn) or whole for part in counted])
+    std = np.sqrt(np.diag(jackknife(left - left.mean(axis=0))))
+    # The intercept is the variance of the pixels beside the stripe, which includes the shot noise of its halo.
+    lines_last = mean if across == 2 else mean.transpose(0, 2, 1)
+    halo = whole[0] * max(background_dn - _dimmest(lines_last, background_dn + dark_dn), 0.0)
+    dark = math.sqrt(max(whole[1] - halo, 0.0))
+    variance_std = math.hypot(float(std[1]), _HALO_STD * halo)
+    freedom = float(np.mean([len(numbers) - 1 for numbers in repeated]))
+    fit = _judge_transfer(counted.sum(axis=0), background_dn, *whole, freedom)
+    return CameraNoise(whole[0], float(std[0]), dark, variance_std / max(2 * dark, 1e-3), fit)
 
 
 def _still_variance(images: np.ndarray) -> np.ndarray:

@@ -1,28 +1,41 @@
-"""Light of a laser stripe on a matt surface in water: geometry and power of every stripe centre, in closed form.
+"""Light of a laser stripe on a matt surface in water, and its halo by scattering, in closed form.
 
 The sheet carries the power p per length across its rays. A surface point with the normal N, lit along d and seen along
 r, has the radiance rho / pi times the irradiance |N . d| E. Integrated across the stripe, E gives p. The image of the
 stripe, integrated over the pixels across it, is therefore proportional to p |N . d| / m, where m is the distance from
 the sheet to the surface point of a pixel, per pixel. It does not depend on the thickness of the sheet or on blur.
+
+For the halo, light is scattered on the way to the surface and on the way to the camera. Let a surface point be at the
+distance x from the sheet. Along the path D before the surface, the sheet scatters the fraction b dl per length; from
+the element at l and y, the point receives p(a) / (x^2 + y^2 + l^2), with the phase function p at the angle a =
+atan(sqrt(x^2 + y^2) / l). The sum over y and l is the line spread q(x) of single scattering per b. The same function
+describes the path to the camera, with the distance from the camera ray instead of the sheet.
+
+Small angles add up when light is scattered several times. The Fourier transform of the whole line spread is then that
+of the unscattered stripe times exp(b Q), with the transform Q of q (Wells 1969, JOSA 59:686; Mobley, Light and Water,
+Sec. 5.2). Light that is scattered once by a large angle, from the sheet straight into the camera, is neglected: it is a
+thousandth of the halo.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from uwlts.errors import CaptureError
 from uwlts.fitting.local_surface import surface_normals
 from uwlts.model.calibration import Calibration
-from uwlts.model.placement import LaserPose, apparent_depth_mm
+from uwlts.model.placement import LaserPose, apparent_depth_mm, laser_pose
 from uwlts.model.sensor import Camera, CaptureHeader, Laser, Sensor, Window
 from uwlts.model.stripe import CaptureStripes, stack_pixels
 from uwlts.optics.camera import directions
+from uwlts.optics.design import WindowGeometry, length_outside_mm, trace_to_points
 from uwlts.optics.triangulation import points_on_sheet, rays_on_sheet, to_object
 from uwlts.optics.window import RayStatus, trace_window
-from uwlts.radiometry.followed_sensor import calibrated_pose
 
 _MOVED_PX = 0.5
 """Step in px for derivatives of the points with respect to the stripe centre."""
@@ -32,9 +45,14 @@ _FEWEST_POSITIONS = 5
 """Least number of stage positions of a scan: those of one plane for a normal."""
 _STEPS = 2.5
 """Radius of the planes that give the normals, in steps of the stage: five images, also on inclined surfaces."""
-_NEWTON_STEPS = 8  # of the ray through the window; converges quadratically
 _JOULE_NM = 6.62607015e-34 * 299792458.0 * 1e9
 """Energy of a photon times its wavelength in nm, J nm (SI)."""
+_LEAST_MM = 1e-3
+"""Least distance from the sheet, far below a pixel; light scattered by less stays in the stripe."""
+_DISTANCES, _ALONG, _ACROSS = 32, 96, 72
+STEP_PX = 0.5  # below the width of any stripe
+_CELLS = 4096
+"""Step and number of cells of line spreads: some 2,000 px, beyond which little light is scattered."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,24 +112,34 @@ def light_at(
     )
     point, ray, slope = found.points_mm[:count], rays[:count], slopes[:count]
     along = (found.points_mm[count:] - point) / _MOVED_PX
-    fan = _fan_light(sensor.laser, calibrated_pose(sensor, calibration), point, medium_index=medium_index)
-    lit, seen = np.abs(_dot(normal, fan.direction)), np.abs(_dot(normal, ray))
+    pose = calibrated_pose(sensor, calibration)
+    direction, per_mm, path, angle = _fan_light(sensor.laser, pose, point, medium_index=medium_index)
+    lit, seen = np.abs(np.vecdot(normal, direction)), np.abs(np.vecdot(normal, ray))
     window = calibration.window if sensor.camera.window.mounted else None
     in_air = directions(calibration.camera, pixels)
     camera_path = np.linalg.norm(point - trace_window(in_air, window, medium_index=medium_index).origins, axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         # A ray one pixel further meets the surface at this distance along the ray from its crossing of the sheet.
-        shift = -_dot(normal, along) / _dot(normal, ray)
+        shift = -np.vecdot(normal, along) / np.vecdot(normal, ray)
         sheet_per_px = np.abs(slope * shift)
-        grey = (
-            _grey_per_radiance(sensor, medium_index) * in_air[:, 2] ** 4 * fan.per_mm * lit / (math.pi * sheet_per_px)
-        )
-    across = along - _dot(along, ray)[:, None] * ray
+        grey = _grey_per_radiance(sensor, medium_index) * in_air[:, 2] ** 4 * per_mm * lit / (math.pi * sheet_per_px)
+    across = along - np.vecdot(along, ray)[:, None] * ray
     good = (found.status[:count] == RayStatus.OK) & (found.status[count:] == RayStatus.OK)
     good &= (lit > _GRAZING) & (seen > _GRAZING) & np.isfinite(grey) & (grey > 0)
-    values = (grey, fan.path_mm, camera_path, fan.distance_mm, point[:, 2], sheet_per_px)
-    values += (np.linalg.norm(across, axis=1), fan.angle)
+    distance = np.linalg.norm(point - pose.origin_mm, axis=1)
+    values = grey, path, camera_path, distance, point[:, 2], sheet_per_px, np.linalg.norm(across, axis=1), angle
     return StripeLight(good, *(np.where(good, value, np.nan) for value in values))
+
+
+def calibrated_pose(sensor: Sensor, calibration: Calibration) -> LaserPose:
+    """Return the described pose of the laser, moved into the calibrated sheet."""
+    described, normal = laser_pose(sensor), np.array(calibration.sheet.normal)
+    sign = float(np.sign(normal @ described.normal))
+    normal, offset = sign * normal, sign * calibration.sheet.offset_mm
+    origin = described.origin_mm + (offset - normal @ described.origin_mm) * normal
+    axis = described.axis - (described.axis @ normal) * normal
+    axis /= np.linalg.norm(axis)
+    return LaserPose(origin, axis, np.cross(axis, normal), normal)
 
 
 def transmission(window: Window, *, wavelength_nm: float, medium_index: float) -> float:
@@ -163,45 +191,28 @@ def _grey_per_radiance(sensor: Sensor, index: float) -> float:
     return per_irradiance * aperture / index**2 * windows[0] * windows[1]
 
 
-@dataclass(frozen=True, eq=False)
-class _FanLight:
-    """Rays of the fan at points (N,): direction, power per length across the rays for 1 mW (1/mm), paths, angle."""
-
-    direction: np.ndarray
-    per_mm: np.ndarray
-    path_mm: np.ndarray
-    distance_mm: np.ndarray
-    angle: np.ndarray
-
-
-def _fan_light(laser: Laser, pose: LaserPose, point: np.ndarray, *, medium_index: float) -> _FanLight:
+def _fan_light(
+    laser: Laser, pose: LaserPose, point: np.ndarray, *, medium_index: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the fan's light at points (N, 3), by refraction at a window normal to the axis.
 
-    The ray at the angle a in air has the angles g in glass and m in the medium. Behind the lengths d, t and w along the
-    axis, it is at y = d tan a + t tan g + w tan m. The power per length across a ray is P'(a) / (dy/da cos m).
+    These are directions (N, 3), power per length across the rays for 1 mW (1/mm), paths in the medium, and angles in
+    air divided by half the fan angle. A ray has the angles a in air and m in the medium, and ends at the distance y
+    from the axis. The power per length across it is P'(a) / (dy/da cos m).
     """
     away = point - pose.origin_mm
     y, z = away @ pose.fan, away @ pose.axis
-    window = laser.window
-    parts = [(0.0, 1.0), (0.0, 1.0), (z, medium_index)]
-    if window.mounted:
-        glass = window.index(laser.wavelength_nm)
-        inside = window.distance_mm, window.thickness_mm
-        parts = [(inside[0], 1.0), (inside[1], glass), (z - sum(inside), medium_index)]
-    sine, by_sine = y / np.hypot(y, z), np.ones_like(y)
-    for _ in range(_NEWTON_STEPS):
-        reach, by_sine = np.zeros_like(y), np.zeros_like(y)
-        for length, n in parts:
-            cosine = np.sqrt(1 - (sine / n) ** 2)
-            reach += length * sine / (n * cosine)
-            by_sine += length / (n * cosine**3)
-        sine = np.clip(sine - (reach - y) / by_sine, -0.99, 0.99)
-    tilt = np.sqrt(1 - (sine / medium_index) ** 2)
-    angle = np.arcsin(sine)
-    direction = (sine / medium_index)[:, None] * pose.fan + tilt[:, None] * pose.axis
-    per_mm = _power_per_rad(laser, angle) / (by_sine * np.cos(angle) * tilt)
-    half = math.radians(laser.fan_angle_deg / 2)
-    return _FanLight(direction, per_mm, parts[2][0] / tilt, np.linalg.norm(away, axis=1), angle / half)
+    inside, glass = (0.0, 0.0), 1.0
+    if (window := laser.window).mounted:
+        inside, glass = (window.distance_mm, window.thickness_mm), window.index(laser.wavelength_nm)
+    geometry = WindowGeometry((0.0, 0.0, 1.0), *inside, glass, medium_index)
+    ray = trace_to_points(np, geometry, (y, np.zeros_like(y), z))
+    tilt = 1 / np.sqrt(1 + ray.slope_outside**2)
+    angle = np.copysign(np.arctan(ray.slope), y)
+    direction = tilt[:, None] * (np.copysign(ray.slope_outside, y)[:, None] * pose.fan + pose.axis)
+    per_mm = _power_per_rad(laser, angle) / (ray.growth_mm * (1 + ray.slope**2) * tilt)
+    path = length_outside_mm(np, geometry, ray)
+    return direction, per_mm, path, angle / math.radians(laser.fan_angle_deg / 2)
 
 
 def _power_per_rad(laser: Laser, angle: np.ndarray) -> np.ndarray:
@@ -229,5 +240,53 @@ def _normals(
     return normals
 
 
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.einsum("ij,ij->i", a, b)
+def line_spread(per_sr: Callable[[np.ndarray], np.ndarray], distance_mm: np.ndarray, path_mm: float) -> np.ndarray:
+    """Return the line spread (N,) of single scattering, per mm and per scattering coefficient in 1/mm: no unit.
+
+    ``per_sr`` is the phase function, 1/sr at angles in rad. Distances (N,) from the sheet are positive; ``path_mm`` is
+    the path in the water before the surface.
+    """
+    # Logarithmic nodes: the integrand varies over the scale of the distance.
+    x = distance_mm[:, None, None]
+    along = np.geomspace(1e-2 * _LEAST_MM, path_mm, _ALONG)[:, None]
+    across = np.geomspace(1e-2 * _LEAST_MM, path_mm, _ACROSS)
+    aside = np.sqrt(x**2 + across**2)
+    value = per_sr(np.clip(np.arctan2(aside, along), 1e-7, np.pi - 1e-7)) / (aside**2 + along**2)
+    over_y = np.trapezoid(value * across, np.log(across), axis=2)
+    return 2 * np.asarray(np.trapezoid(over_y * along[:, 0], np.log(along[:, 0])))
+
+
+class HaloKernel:
+    """Halo of single scattering per scattering coefficient in 1/mm, in cells of `STEP_PX` across the stripe.
+
+    Parameters
+    ----------
+    per_sr
+        Phase function: 1/sr at angles in rad.
+    paths : sequence of (path_mm, mm_per_px)
+        Paths of the light, and the distance from sheet or ray of the next pixel.
+    """
+
+    def __init__(self, per_sr: Callable[[np.ndarray], np.ndarray], paths: tuple[tuple[float, float], ...]):
+        edges_px = STEP_PX * (np.arange(_CELLS // 2) + 0.5)
+        half = np.zeros(_CELLS // 2 + 1)
+        for path_mm, mm_per_px in paths:
+            distance = np.geomspace(_LEAST_MM, edges_px[-1] * mm_per_px, _DISTANCES)
+            spread = line_spread(per_sr, distance, path_mm)
+            # Of the spread by the logarithm of the distance; light below the least distance stays in the stripe.
+            integral = CubicSpline(np.log(distance), spread * distance).antiderivative()
+            held = integral(np.log(edges_px * mm_per_px)) + spread[0] * distance[0]
+            half[:-1] += np.concatenate([[2 * held[0]], np.diff(held)])
+        self._transform = np.fft.rfft(np.concatenate([half, half[-2:0:-1]])).real
+        place = np.fft.fftfreq(_CELLS, 1 / (_CELLS * STEP_PX))
+        self._order = np.argsort(place)
+        self.place_px = place[self._order]
+
+    def profile(self, scattering_per_mm: float, *, sigma_px: float) -> np.ndarray:
+        """Return the image of the stripe per px at `place_px`, for unscattered light with the integral 1.
+
+        ``sigma_px`` is the standard deviation of the unscattered stripe.
+        """
+        turn = 2 * np.pi * np.fft.rfftfreq(_CELLS, STEP_PX)
+        whole = np.exp(scattering_per_mm * self._transform - 0.5 * (turn * sigma_px) ** 2)
+        return np.fft.irfft(whole, _CELLS)[self._order] / STEP_PX

@@ -4,8 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwlts.model.any_calibration import calibration_digest
-from uwlts.model.calibration import Calibration
+from uwlts.model.calibration import Calibration, calibration_digest
 from uwlts.model.mount import Mount, SensorShare
 from uwlts.recalibration.pass_estimate import PassProblem, PassSolution
 

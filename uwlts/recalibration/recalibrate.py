@@ -13,9 +13,8 @@ from uwlts.calibration.joint.stored_estimate import StoredEstimate, read_stored_
 from uwlts.errors import CalibrationError, CaptureError, DescriptionError, RangeError
 from uwlts.fitting.next_observation import CovarianceRoot, Forecast
 from uwlts.fitting.patches import find_disc_radius
-from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.artefacts import Artefact, parse_artefact, read_artefact
-from uwlts.model.calibration import Calibration, KnownMedium, KnownStage
+from uwlts.model.calibration import Calibration, KnownMedium, KnownStage, calibration_digest
 from uwlts.model.library import load_sensor
 from uwlts.model.mount import Mount
 from uwlts.model.parameter_keys import ParameterKey

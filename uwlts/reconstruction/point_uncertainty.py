@@ -18,8 +18,7 @@ from uwlts.errors import CalibrationError
 from uwlts.files.writing import hash_file
 from uwlts.fitting.least_squares import MAD_TO_STD
 from uwlts.fitting.next_observation import CovarianceRoot
-from uwlts.model.any_calibration import calibration_digest
-from uwlts.model.calibration import Calibration
+from uwlts.model.calibration import Calibration, calibration_digest
 from uwlts.model.parameter_keys import StageParameter
 from uwlts.model.sensor import Sensor
 from uwlts.optics.brightness import BLUR_STD, brightness_shift_std

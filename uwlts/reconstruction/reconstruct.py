@@ -10,10 +10,8 @@ import numpy as np
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.files.json_files import EDITED
 from uwlts.fitting.least_squares import robust_std
-from uwlts.model.any_calibration import AnyCalibration, calibration_digest
-from uwlts.model.calibration import Calibration
+from uwlts.model.calibration import AnyCalibration, Calibration, PolynomialCalibration, calibration_digest
 from uwlts.model.mount import Mount
-from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.model.sensor import Table
 from uwlts.model.stripe import CaptureStripes
 from uwlts.model.trajectory import Trajectory

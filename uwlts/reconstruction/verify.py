@@ -11,8 +11,8 @@ from uwlts.errors import EvaluationError, RangeError
 from uwlts.evaluation.artefact_figures import evaluate_cloud
 from uwlts.evaluation.evaluate import ArtefactFigures
 from uwlts.evaluation.figure_uncertainty import figure_uncertainties
-from uwlts.model.any_calibration import AnyCalibration, calibration_digest
 from uwlts.model.artefacts import parse_artefact
+from uwlts.model.calibration import AnyCalibration, calibration_digest
 from uwlts.model.sensor import Vector
 from uwlts.reconstruction.reconstruct import reconstruct
 from uwlts.storage.calibration_file import VerificationRecord, resolve_calibration, write_verification

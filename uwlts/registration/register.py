@@ -19,8 +19,7 @@ from uwlts.argument_types import check_arguments
 from uwlts.errors import EvaluationError
 from uwlts.files.reading import log_warnings
 from uwlts.fitting.patches import surface_patches
-from uwlts.model.calibration import is_rigid
-from uwlts.model.sensor import Table
+from uwlts.model.sensor import Table, is_rigid
 from uwlts.model.short_text import Brief
 from uwlts.registration.coarse_registration import estimate_coarse_poses
 from uwlts.registration.joint_registration import (

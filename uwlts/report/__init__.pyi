@@ -1,6 +1,6 @@
 from . import plot as plot
 from .acceptance_page import write_acceptance as write_acceptance
-from .camera_page import write_camera as write_camera
+from .calibration_pages import write_camera as write_camera, write_recalibration as write_recalibration
 from .certificate import check_certificate as check_certificate
 from .certificate_page import write_certificate as write_certificate
 from .change_page import (
@@ -10,4 +10,3 @@ from .change_page import (
 )
 from .findings_page import write_findings as write_findings
 from .frames import to_frame as to_frame
-from .recalibration_page import write_recalibration as write_recalibration

@@ -8,7 +8,7 @@ from markupsafe import Markup
 
 from uwlts.acceptance.accept import FORMAT, VERSION, Acceptance, JudgedPosition
 from uwlts.acceptance.acceptance_plan import SYMBOLS, CertifiedArtefact, Symbol
-from uwlts.acceptance.characteristics import NAMES, RULES, Characteristic, CharacteristicValue
+from uwlts.acceptance.characteristics import NAMES, RULES, Characteristic
 from uwlts.files.json_files import json_text
 from uwlts.model.artefacts import SphereStandard, StepStandard
 from uwlts.pages.toolkit import (
@@ -29,10 +29,9 @@ from uwlts.pages.toolkit import (
 )
 
 KIND = "acceptance"  # kind of the page, in the name of its JSON file
-_GREEN = "#2e8b57"
-_DECISIONS = {"conformity proven": _GREEN, "accepted": _GREEN, "nonconformity proven": RED, "rejected": RED}
-"""Colours of decisions; all others are open."""
-_OPEN = "#d9822b"
+_DECISIONS = {"conformity proven": "good", "accepted": "good", "nonconformity proven": "bad", "rejected": "bad"}
+"""Kinds of decisions; all others are open."""
+_COLOURS = {"good": "#2e8b57", "bad": RED, "open": "#d9822b"}
 _SIGNED = ("PS", "SD", "E")
 
 
@@ -71,7 +70,7 @@ def acceptance_page(acceptance: Acceptance) -> str:
     measured: list[Symbol] = [
         symbol for symbol in SYMBOLS if any(value.symbol == symbol for value in acceptance.values)
     ]
-    facts = [
+    statements = [
         ("sensor", plan.sensor or "not stated"),
         ("client", plan.client or "not stated"),
         ("operator", plan.operator or "not stated"),
@@ -85,8 +84,8 @@ def acceptance_page(acceptance: Acceptance) -> str:
         "acceptance.html.j2",
         title=plan.title,
         conclusion=f"{acceptance.conclusion[0].upper()}{acceptance.conclusion[1:]}.",
-        colour={_GREEN: "good", RED: "bad", _OPEN: "open"}[_colour_of(acceptance.verdict)],
-        facts=facts,
+        colour=_DECISIONS.get(acceptance.verdict, "open"),
+        statements=statements,
         characteristics=[_characteristic_row(each) for each in acceptance.characteristics],
         limits=_draw_limits(acceptance) if acceptance.values else None,
         places=_draw_places(acceptance) if acceptance.values else None,
@@ -151,10 +150,6 @@ def _stated(value: float | None) -> str:
     return "not stated" if value is None else f"{value:g}"
 
 
-def _colour_of(decision: str) -> str:
-    return _DECISIONS.get(decision, _OPEN)
-
-
 def _draw_limits(acceptance: Acceptance) -> Markup:
     """Draw the values of each characteristic relative to its limit, the worst one with its interval."""
     limited = [each for each in acceptance.characteristics if each.mpe_mm is not None]
@@ -164,7 +159,7 @@ def _draw_limits(acceptance: Acceptance) -> Markup:
         shares = [abs(value.value_mm) / (each.limit_mm(value) or 1.0) for value in own]
         axes.plot(shares, [row] * len(shares), "o", markersize=3, color=SOFT, alpha=0.6)
         if each.worst is not None:
-            colour = _colour_of(each.decision)
+            colour = _COLOURS[_DECISIONS.get(each.decision, "open")]
             limit = each.limit_mm(each.worst) or 1.0
             half, middle = (each.worst.expanded_mm or 0.0) / limit, abs(each.worst.value_mm) / limit
             axes.errorbar(middle, row, xerr=half, fmt="o", color=colour, markersize=7, capsize=4, linewidth=2)
@@ -202,8 +197,11 @@ def _draw_lengths(acceptance: Acceptance) -> Markup:
     """Draw the error of each length with its test value uncertainty and limit."""
     lengths = [value for value in acceptance.values if value.length_mm is not None]
     figure, (axes,) = new_figure(9.0, 3.6)
-    judged = {each.symbol: each for each in acceptance.characteristics}
+    judged, labels = {each.symbol: each for each in acceptance.characteristics}, []
     for place, value in enumerate(lengths):
+        along = "XYZ"[int(np.argmax(np.abs(value.direction)))] if value.direction else ""
+        size = f"{value.symbol}, {value.length_mm or 0.0:.0f} mm, mostly along {along}"
+        labels.append(plain_text(f"{value.position} ({size})"))
         axes.errorbar(
             place, 1e3 * value.value_mm, yerr=1e3 * (value.expanded_mm or 0.0), fmt="o", color=BLUE, capsize=4
         )
@@ -211,11 +209,6 @@ def _draw_lengths(acceptance: Acceptance) -> Markup:
             for sign in (-1, 1):
                 axes.plot([place - 0.35, place + 0.35], [sign * 1e3 * limit] * 2, color=RED, linewidth=1.5)
     axes.axhline(0, color=INK, linewidth=0.8)
-    axes.set_xticks(range(len(lengths)), [_length_label(each) for each in lengths], fontsize=8, rotation=30, ha="right")
+    axes.set_xticks(range(len(lengths)), labels, fontsize=8, rotation=30, ha="right")
     axes.set_ylabel("error / µm")
     return figure_svg(figure)
-
-
-def _length_label(value: CharacteristicValue) -> str:
-    along = "XYZ"[int(np.argmax(np.abs(value.direction)))] if value.direction else ""
-    return plain_text(f"{value.position} ({value.symbol}, {value.length_mm or 0.0:.0f} mm, mostly along {along})")

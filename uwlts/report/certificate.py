@@ -18,15 +18,14 @@ from uwlts.calibration.joint.observability import (
 )
 from uwlts.calibration.joint.stored_estimate import require_joint
 from uwlts.errors import CaptureError
-from uwlts.files.json_files import SEAL, compute_seal, read_json
+from uwlts.files.json_files import SEAL, compute_seal, numbers_in, read_json
 from uwlts.files.writing import hash_file
 from uwlts.fitting.next_observation import Candidate, Forecast
-from uwlts.model.any_calibration import calibration_digest
-from uwlts.model.calibration import Calibration
+from uwlts.model.calibration import Calibration, calibration_digest
 from uwlts.model.joint_estimate import ImageFit
 from uwlts.model.parameter_keys import ParameterKey, WindowParameter, parse_parameter
 from uwlts.model.sensor import Description, Medium
-from uwlts.pages.toolkit import MISSING, format_to_scale, numbers_in
+from uwlts.pages.toolkit import MISSING, format_to_scale
 from uwlts.report.certificate_volume import (
     CalibrationInUse,
     LengthUncertainty,

@@ -19,7 +19,7 @@ from uwlts.errors import CaptureError, EvaluationError
 from uwlts.files.reading import read_text
 from uwlts.model.library import read_table, validate_description
 from uwlts.model.sensor import Description
-from uwlts.report.certificate import AnyCertificate, JointCertificate, ParameterRow
+from uwlts.report.certificate import AnyCertificate, JointCertificate
 from uwlts.runtime.optional_library import optional_library
 
 DCC, SI = "https://ptb.de/dcc", "https://ptb.de/si"
@@ -231,8 +231,10 @@ def _add_results(parent: ET.Element, content: AnyCertificate, stated: Administra
     results = _child(parent, "results")
     parameters = _result(results, "Parameters")
     for row in content.parameters:
+        if row.unit not in UNITS:
+            raise EvaluationError(f"the unit {row.unit!r} of {row.name} is none of {', '.join(map(repr, UNITS))}")
         words = f"{row.words} ({row.name}){' in pixels' if row.unit == 'px' else ''}"
-        _quantity(parameters, words, row.value, _unit_of(row), None if row.std is None else 2 * row.std)
+        _quantity(parameters, words, row.value, UNITS[row.unit], None if row.std is None else 2 * row.std)
     if isinstance(content, JointCertificate):
         _add_lengths_and_volume(results, content)
 
@@ -311,12 +313,6 @@ def _quantity(
         ET.SubElement(uncertainty, f"{{{SI}}}distribution").text = "normal"
 
 
-def _unit_of(row: ParameterRow) -> str:
-    if row.unit not in UNITS:
-        raise EvaluationError(f"the unit {row.unit!r} of {row.name} is none of {', '.join(map(repr, UNITS))}")
-    return UNITS[row.unit]
-
-
 def _decimal(value: float, expanded: float | None) -> str:
     """Return a number in the form of D-SI, with the digits of two significant ones of its uncertainty (GUM 7.2.6).
 
@@ -356,7 +352,9 @@ def _identify(parent: ET.Element, issuer: str, value: str, words: str, kind: str
 
 def _child(parent: ET.Element, name: str, text: str | None = None) -> ET.Element:
     child = ET.SubElement(parent, f"{{{DCC}}}{name}")
-    child.text = None if text is None else _printable(text)
+    if text is not None:
+        # XML 1.0 cannot contain other characters.
+        child.text = re.sub(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "?", text)
     return child
 
 
@@ -364,11 +362,6 @@ def _text(parent: ET.Element, name: str, text: str) -> None:
     """Add an element with a text in the language of the certificate."""
     content = _child(_child(parent, name), "content", text)
     content.set("lang", _LANGUAGE)
-
-
-def _printable(text: str) -> str:
-    """Replace characters that XML 1.0 cannot contain."""
-    return re.sub(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "?", text)
 
 
 _MOST_BYTES = 64 * 2**20  # largest certificate; one with pictures of all its data has some megabytes

@@ -12,18 +12,14 @@ from scipy.spatial.transform import Rotation
 from uwlts.acceptance.accept import FORMAT as ACCEPTANCE, Acceptance, read_acceptance
 from uwlts.errors import CaptureError
 from uwlts.evaluation.evaluate import FORMAT as EVALUATION, Evaluation, read_evaluation
-from uwlts.evaluation.figures import TruthComparison
-from uwlts.files.json_files import read_json
+from uwlts.files.json_files import numbers_in, read_json
 from uwlts.files.reading import MOST_TOML_BYTES, is_regular_file, parse_toml, read_text, require_regular_file
-from uwlts.model.any_calibration import AnyCalibration
-from uwlts.model.calibration import Calibration
+from uwlts.model.calibration import AnyCalibration, Calibration, PolynomialCalibration
 from uwlts.model.library import load_sensor
 from uwlts.model.mount import FORMAT as MOUNT, BoardFound, Mount, SphereFound
 from uwlts.model.placement import check_design, view_of_sheet
-from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.model.trajectory import Trajectory, format_time
-from uwlts.pages.toolkit import numbers_in
 from uwlts.report.certificate import parameter_rows
 from uwlts.report.digital_certificate import digital_certificate_lines
 from uwlts.storage.calibration_file import FORMAT as CALIBRATION, POLYNOMIALS_FORMAT, load_calibration
@@ -189,20 +185,15 @@ def describe(
 
 def _other_description(path: Path) -> list[str]:
     """Return what a description other than a sensor's is, by its keys; empty for a sensor or none of them."""
-    if path.suffix != ".toml" or not is_regular_file(path):
-        return []
-    with suppress(ValueError):
-        return _kind_of(parse_toml(read_text(path, most_bytes=MOST_TOML_BYTES, called="description")))
+    table: dict[str, JsonValue] = {}
+    if path.suffix == ".toml" and is_regular_file(path):
+        with suppress(ValueError):
+            table = parse_toml(read_text(path, most_bytes=MOST_TOML_BYTES, called="description"))
+    for kind, keys, command in _DESCRIPTIONS:
+        if table.keys() >= keys:
+            title = table.get("title") or table.get("name")
+            return [kind + (f": {title}" if title else ""), f"with {', '.join(table)}", f"used by {command}"]
     return []
-
-
-def _kind_of(table: Mapping[str, JsonValue]) -> list[str]:
-    """Return what a description is by its keys; empty if they are not known."""
-    found = next((each for each in _DESCRIPTIONS if table.keys() >= each[1]), None)
-    if found is None:
-        return []
-    title = table.get("title") or table.get("name")
-    return [found[0] + (f": {title}" if title else ""), f"with {', '.join(table)}", f"used by {found[2]}"]
 
 
 def _lines_of(found: object) -> list[str]:
@@ -369,15 +360,9 @@ def _parameter_lines(calibration: Calibration) -> list[str]:
 
 
 def _figure_lines(calibration: Calibration | PolynomialCalibration, **shown: tuple[str, str]) -> list[str]:
-    """Format figures of calibration steps, each given by name and text; ValueError if one is not a number."""
-    lines = []
-    for step, (name, text) in shown.items():
-        value = calibration.figures(step).get(name)
-        if not isinstance(value, int | float | None):
-            raise ValueError(f"{value!r}")
-        if value is not None:
-            lines.append(text.format(value))
-    return lines
+    """Format figures of calibration steps, each given by name and text."""
+    found = ((calibration.figures(step).get(name), text) for step, (name, text) in shown.items())
+    return [text.format(value) for value, text in found if value is not None]
 
 
 def mount_lines(mount: Mount) -> list[str]:
@@ -469,20 +454,11 @@ def evaluation_lines(record: Evaluation) -> list[str]:
                     f"{100 * part.share_within_tolerance:.1f} % within {part.tolerance_mm:g} mm"
                 )
         if truth.shift_mm is not None:
-            shift = ", ".join(f"{axis} {value}" for axis, value in zip("XYZ", _shift_texts(truth), strict=True))
-            lines.append(f"  shift of all points: {shift}{' (k = 2)' if truth.shift_expanded_mm else ''}")
+            stated = [f" ± {each:.4f}" for each in truth.shift_expanded_mm or ()] or [""] * 3
+            shift = (f"{axis} {value:+.4f}{u} mm" for axis, value, u in zip("XYZ", truth.shift_mm, stated, strict=True))
+            lines.append(f"  shift of all points: {', '.join(shift)}{' (k = 2)' if truth.shift_expanded_mm else ''}")
         lines.append(f"  {truth.missed} stripe points missed, {truth.false_points} false")
     return lines
-
-
-def _shift_texts(truth: TruthComparison) -> list[str]:
-    """Return the mean errors of all points along X, Y and Z with uncertainty, as text; empty if not in the file."""
-    shift = truth.shift_mm or ()
-    stated = truth.shift_expanded_mm or (None,) * len(shift)
-    return [
-        f"{value:+.4f} mm" if expanded is None else f"{value:+.4f} ± {expanded:.4f} mm"
-        for value, expanded in zip(shift, stated, strict=True)
-    ]
 
 
 def sensor_lines(sensor: Sensor) -> list[str]:

@@ -14,7 +14,7 @@ import numpy as np
 from uwlts._version import __version__
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.evaluate import read_evaluation
-from uwlts.evaluation.figures import VERDICTS
+from uwlts.evaluation.figures import VERDICTS, Figure
 from uwlts.files.json_files import EDITED, json_text
 from uwlts.files.writing import hash_file
 from uwlts.inspection.features import (
@@ -27,7 +27,7 @@ from uwlts.inspection.features import (
     Inspection,
 )
 from uwlts.inspection.inspect import InspectionKind, inspect_cloud
-from uwlts.model.any_calibration import calibration_digest
+from uwlts.model.calibration import calibration_digest
 from uwlts.model.sensor import Table
 from uwlts.pages.toolkit import (
     INK,
@@ -79,16 +79,6 @@ class Source:
     name: str
     sha256: str
     note: str
-
-
-@dataclass(frozen=True)
-class _CheckedFigure:
-    """A figure of an artefact in mm, with its expanded uncertainty (k = 2) and the calibrated size, if any."""
-
-    name: str
-    calibrated_mm: float | None
-    value_mm: float
-    expanded_mm: float | None
 
 
 def write_findings(
@@ -184,7 +174,19 @@ def write_findings(
         "software": f"uwlts {__version__}",
         "sources": [vars(source) for source in sources],
         "verification": [
-            {"artefact": artefact, "figures": [vars(each) for each in figures]} for artefact, figures in checks
+            {
+                "artefact": artefact,
+                "figures": [
+                    {
+                        "name": each.key.name,
+                        "calibrated_mm": each.calibrated_mm,
+                        "value_mm": each.value_mm,
+                        "expanded_mm": each.expanded_uncertainty_mm,
+                    }
+                    for each in figures
+                ],
+            }
+            for artefact, figures in checks
         ],
         "order": stated.model_dump(mode="json", exclude_none=True),
         "verdicts": {each.name: judge_feature(each, stated.limits)[0] for each in found.features},
@@ -227,7 +229,7 @@ def _sources(
     return sources
 
 
-def _artefact_check(path: str | Path, cloud: PointCloud) -> tuple[str, list[_CheckedFigure]]:
+def _artefact_check(path: str | Path, cloud: PointCloud) -> tuple[str, tuple[Figure, ...]]:
     """Return name and figures of an artefact that was measured with the calibration named by the cloud."""
     record, named = read_evaluation(path), cloud.metadata.get("calibration")
     if record.artefact is None or record.evaluation is None:
@@ -237,30 +239,22 @@ def _artefact_check(path: str | Path, cloud: PointCloud) -> tuple[str, list[_Che
             f"{path} is of a cloud made by another calibration: it names {str(record.calibration)[:12]}, the cloud "
             f"{str(named)[:12]}; measure the artefact with the calibration in use"
         )
-    figures, keys = record.evaluation.figures_mm, record.figure_keys()
-    rows = []
-    for name, measured in figures.items():
-        known, key = record.uncertainty.get(name), keys.get(name)
-        calibrated = None if key is None or key.calibrated is None else key.calibrated.value_mm
-        rows.append(_CheckedFigure(name, calibrated, measured, None if known is None else known.expanded_mm))
-    return f"{record.evaluation.kind}, {record.source}{', edited' if record.edited else ''}", rows
+    return f"{record.evaluation.kind}, {record.source}{', edited' if record.edited else ''}", record.figures
 
 
-def _check_rows(figures: Sequence[_CheckedFigure]) -> list[tuple[str, ...]]:
-    rows = []
-    for each in figures:
-        fine = each.expanded_mm or _SMALLEST_MM
-        calibrated = MISSING if each.calibrated_mm is None else f"{each.calibrated_mm:g}"
-        stated = MISSING if each.expanded_mm is None else format_to_scale(each.expanded_mm, fine, digits=2)
-        rows.append((each.name.replace("_", " "), calibrated, format_to_scale(each.value_mm, fine, digits=2), stated))
-    return rows
+def _check_row(figure: Figure) -> tuple[str, ...]:
+    expanded = figure.expanded_uncertainty_mm
+    fine = expanded or _SMALLEST_MM
+    calibrated = MISSING if figure.calibrated_mm is None else f"{figure.calibrated_mm:g}"
+    stated = MISSING if expanded is None else format_to_scale(expanded, fine, digits=2)
+    return figure.key.name.replace("_", " "), calibrated, format_to_scale(figure.value_mm, fine, digits=2), stated
 
 
 def _page(
     found: Inspection,
     cloud: PointCloud,
     sources: list[Source],
-    checks: list[tuple[str, list[_CheckedFigure]]],
+    checks: list[tuple[str, tuple[Figure, ...]]],
     order: FindingOrder,
     by_hand: MeasuredValues | None,
     *,
@@ -279,8 +273,8 @@ def _page(
         "findings.html.j2",
         title=title,
         made=made,
-        tiles=[tile for tile in _tiles(whole, parts) if tile.accent],
-        facts=_facts(order, cloud, sources, found),
+        worst=_tiles(parts),
+        statements=_facts(order, cloud, sources, found),
         conclusion=_conclude(listed, order, found),
         findings=_finding_rows(listed, found, cloud, order) if listed else None,
         all_values=_rows(parts),
@@ -292,7 +286,7 @@ def _page(
         left_out=len(parts) - len(drawn),
         notes=found.notes,
         sources=[(each.role, each.name, each.note, each.sha256) for each in sources],
-        checks=[(artefact, _check_rows(figures)) for artefact, figures in checks],
+        checks=[(artefact, list(map(_check_row, figures))) for artefact, figures in checks],
         stated=cloud.uncertainty is not None,
         searched=found.kind == "pipe",
         coverage=f"{100 * COVERAGE:.0f} %",
@@ -403,7 +397,7 @@ def _rows(features: Sequence[Feature]) -> tuple[tuple[str, ...], list[tuple[str,
     return ("finding", "place / mm", *(f"{name} / {unit}" for name, unit in units.items())), rows
 
 
-def _tiles(whole: list[Feature], parts: list[Feature]) -> list[Tile]:
+def _tiles(parts: list[Feature]) -> list[Tile]:
     tiles = []
     for kind in _BLEMISHES:
         if own := [each for each in parts if each.kind == kind]:
@@ -416,10 +410,6 @@ def _tiles(whole: list[Feature], parts: list[Feature]) -> list[Tile]:
     if walls:
         least = min(walls, key=lambda value: value.value)
         tiles.append(Tile("least remaining wall", f"{format_interval(least)} {least.unit}", accent=True))
-    for each in whole[:1]:
-        for value in each.values[:5]:
-            if not value.name.startswith("axis"):
-                tiles.append(Tile(f"{each.name}: {value.name}", f"{format_interval(value)} {value.unit}"))
     return tiles
 
 

@@ -76,7 +76,7 @@ def to_frame(result: object) -> DataFrame:
             table = columns
         case Mapping():
             table = result
-        case Sequence() if all(map(_is_record, result)):
+        case Sequence() if all(_field_names(type(each)) for each in result):
             table = [_row(each) for each in result]
         case _:
             raise ArgumentError(
@@ -100,10 +100,6 @@ def _point_columns(cloud: PointCloud) -> dict[str, np.ndarray]:
     if cloud.uncertainty is not None:
         columns |= dict(zip(_axis_names("std_mm"), cloud.uncertainty.std_mm().T, strict=True))
     return {name: values for name, values in columns.items() if values is not None}
-
-
-def _is_record(value: object) -> bool:
-    return isinstance(value, BaseModel) or hasattr(value, "_fields") or dataclasses.is_dataclass(value)
 
 
 def _row(record: object) -> dict[str, Any]:
@@ -135,9 +131,10 @@ def _flatten(record: object | None, kind: type) -> dict[str, Any]:
 
 
 def _field_names(kind: Any) -> Sequence[str]:
+    """Return the names of a record's fields; none for other types."""
     if dataclasses.is_dataclass(kind):
         return [field.name for field in dataclasses.fields(kind)]
-    return list(kind.model_fields) if issubclass(kind, BaseModel) else kind._fields
+    return list(kind.model_fields) if issubclass(kind, BaseModel) else getattr(kind, "_fields", ())
 
 
 def _mark_missing(value: object, hint: object) -> object:

@@ -6,10 +6,9 @@ Every function draws into ``ax``, or into a new figure in the style of the pages
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
 from itertools import product
-from typing import Any, assert_never
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,20 +18,10 @@ from mpl_toolkits.mplot3d import Axes3D, proj3d
 
 from uwlts.argument_types import check_arguments
 from uwlts.errors import ImageError
+from uwlts.files.json_files import number_list
 from uwlts.model.calibration import Calibration
-from uwlts.pages.cloud_figure import AZIMUTH_DEG, ELEVATION_DEG, STOPS, CloudField, colour_limit_mm, view_direction
-from uwlts.pages.toolkit import (
-    BLUE,
-    INK,
-    entries_of,
-    make_figure,
-    new_figure,
-    number_list,
-    plain_text,
-    split_name,
-    unit_for,
-    unit_of,
-)
+from uwlts.pages.cloud_figure import AZIMUTH_DEG, ELEVATION_DEG, STOPS, CloudField, scale_values, view_direction
+from uwlts.pages.toolkit import BLUE, INK, make_figure, new_figure, plain_text
 from uwlts.storage.capture import Frame
 from uwlts.storage.cloud import PointCloud
 from uwlts.stripe import Stripe
@@ -42,15 +31,24 @@ DEVIATIONS = LinearSegmentedColormap.from_list(
 )
 """Blue below, grey at zero, red above."""
 
+_STYLES: dict[CloudField, tuple[str, Any]] = {
+    "deviation": ("deviation", DEVIATIONS),
+    "depth": ("Z", "viridis"),
+    "intensity": ("brightness", "cividis"),
+    "random": ("random standard uncertainty", "viridis"),
+    "common": ("common standard uncertainty", "viridis"),
+}
+"""Names and colours of the quantities of points."""
+
 UNKNOWN = "#555550"
 """Colour of points without a deviation in a cloud with deviations."""
 PLAIN = "#5d82a8"
 """Colour of points in a cloud without deviations."""
 ORANGE = "#ff7800"
 """Colour of stripe centres."""
-SHORT_LIST = 3
-"""Lists of residuals up to this length are written into tables; longer ones are drawn."""
+_SHORT_LIST = 3  # lists of residuals up to this length are not drawn
 
+_UNITS = {"px": "px", "mm": "mm", "deg": "°", "rad": "rad", "nm": "nm"}  # of names of residuals
 # Residuals within this ratio are drawn as dots: bars, which start at zero, would all look the same.
 _FLAT = 1.2
 # Fraction of a surface's points within the colour range.
@@ -97,24 +95,28 @@ def cloud(cloud: PointCloud, ax: Axes3D | None = None, colour: CloudField = "dev
         ax.set_axis_off()
         ax.text2D(0.5, 0.5, "the cloud has no points", transform=ax.transAxes, ha="center")
         return ax
-    low, high = cloud_limits(cloud.points_mm)
+    low, high = cloud.points_mm.min(axis=0), cloud.points_mm.max(axis=0)
+    half = np.maximum(0.52 * (high - low), 0.02 * max(1e-6, float((high - low).max())))
+    low, high = (low + high) / 2 - half, (low + high) / 2 + half
     # The farthest points are drawn first, so that the nearest remain visible.
     points = cloud.points_mm[order := np.argsort(-(cloud.points_mm @ view_direction()), kind="stable")]
-    values, label, scale = _select_values(cloud, colour)
+    values = cloud.field_values(colour)
     size = float(np.clip(1e5 / len(cloud), 1.0, 16.0))
     style: dict[str, Any] = {"s": size, "linewidths": 0, "depthshade": False, "rasterized": True}
-    if values is None:
+    if values is None or not np.isfinite(values).any():
         ax.scatter(*points.T, color=PLAIN, **style)
         if bar is not None:
             bar.remove()
     else:
-        values = values[order]
+        values, unit, limit = scale_values(values[order], colour)
         known = np.isfinite(values)
         if not known.all():
             ax.scatter(*points[~known].T, color=UNKNOWN, label="not evaluated", **style)
             ax.legend(loc="upper left", bbox_to_anchor=(0, 1), bbox_transform=legend_at, markerscale=3, frameon=False)
-        drawn = ax.scatter(*points[known].T, c=values[known], **style, **scale)
-        ax.figure.colorbar(drawn, cax=bar, ax=None if bar else ax, label=label)
+        style |= {} if limit is None else {"vmin": -limit, "vmax": limit}
+        name, colours = _STYLES[colour]
+        drawn = ax.scatter(*points[known].T, c=values[known], cmap=colours, **style)
+        ax.figure.colorbar(drawn, cax=bar, ax=None if bar else ax, label=f"{name} / {unit}")
     for axis, name, start, end in zip((ax.xaxis, ax.yaxis, ax.zaxis), "XYZ", low, high, strict=True):
         axis.set_label_text(f"{name} / mm")
         axis.labelpad = 18
@@ -129,41 +131,10 @@ def cloud(cloud: PointCloud, ax: Axes3D | None = None, colour: CloudField = "dev
     return ax
 
 
-def _select_values(cloud: PointCloud, colour: CloudField) -> tuple[np.ndarray | None, str, dict[str, Any]]:
-    """Return values (N,) with label and style; None if the cloud does not have them."""
-    values = cloud.field_values(colour)
-    if values is None:
-        return None, "", {}
-    match colour:
-        case "deviation":
-            if not np.isfinite(values).any():
-                return None, "", {}
-            limit = colour_limit_mm(values)
-            unit, factor = unit_for(limit)
-            style = {"cmap": DEVIATIONS, "vmin": -factor * limit, "vmax": factor * limit}
-            return factor * values, f"deviation / {unit}", style
-        case "depth":
-            return values, "Z / mm", {"cmap": "viridis"}
-        case "intensity":
-            return values, "brightness / grey levels", {"cmap": "cividis"}
-        case "random" | "common":
-            unit, factor = unit_for(float(np.median(values)))
-            return factor * values, f"{colour} standard uncertainty / {unit}", {"cmap": "viridis"}
-        case _:
-            assert_never(colour)
-
-
 def deviation_colours(deviation_mm: np.ndarray, limit_mm: float) -> np.ndarray:
     """Return red, green and blue (N, 3) uint8 of deviations (N,): `DEVIATIONS` up to the limit, `UNKNOWN` for NaN."""
     shown = DEVIATIONS.with_extremes(bad=UNKNOWN)
     return shown(np.ma.masked_invalid((deviation_mm / limit_mm + 1) / 2), bytes=True)[:, :3]
-
-
-def cloud_limits(points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return lower and upper limits (3,) of axes that contain the points, each of non-zero length."""
-    low, high = (points_mm.min(axis=0), points_mm.max(axis=0)) if len(points_mm) else (np.zeros(3), np.ones(3))
-    half = np.maximum(0.52 * (high - low), 0.02 * max(1e-6, float((high - low).max())))
-    return (low + high) / 2 - half, (low + high) / 2 + half
 
 
 def surface_limit_mm(distance_mm: np.ndarray) -> float:
@@ -213,7 +184,10 @@ def stripe(
         return ax
     lines = _shown_lines(stripe, enlarged=enlarged)
     centres = stripe.centre_px[lines]
-    left, right, top, bottom = stripe_window(stripe, grey.shape, enlarged=enlarged)
+    margin = _AROUND_ENLARGED_PX if enlarged else _AROUND_PX
+    left, right = max(0, int(lines.min()) - 2), min(grey.shape[1] - 1, int(lines.max()) + 2)
+    top = max(0, int(np.floor(centres.min())) - margin)
+    bottom = min(grey.shape[0] - 1, int(np.ceil(centres.max())) + margin)
     ax.set(xlim=(left - 0.5, right + 0.5), ylim=(bottom + 0.5, top - 0.5))
     if not enlarged:
         ax.plot(lines, centres, ".", color=ORANGE, markersize=1.5, label=f"{len(lines)} stripe centres")
@@ -224,18 +198,6 @@ def stripe(
     ax.plot(x, y, ".-", color=ORANGE, linewidth=1, markersize=7, label="centre found on each line")
     ax.images[0].set_clim(0, float(grey[top : bottom + 1, left : right + 1].max()) or 1)
     return ax
-
-
-def stripe_window(stripe: Stripe, shape: Sequence[int], *, enlarged: bool = False) -> tuple[int, int, int, int]:
-    """Return first and last line, first and last pixel of the part shown by `stripe`; ``shape`` is (pixels, lines)."""
-    lines, margin = _shown_lines(stripe, enlarged=enlarged), _AROUND_ENLARGED_PX if enlarged else _AROUND_PX
-    centres = stripe.centre_px[lines]
-    return (
-        max(0, int(lines.min()) - 2),
-        min(shape[1] - 1, int(lines.max()) + 2),
-        max(0, int(np.floor(centres.min())) - margin),
-        min(shape[0] - 1, int(np.ceil(centres.max())) + margin),
-    )
 
 
 def _shown_lines(stripe: Stripe, *, enlarged: bool) -> np.ndarray:
@@ -251,57 +213,67 @@ def _shown_lines(stripe: Stripe, *, enlarged: bool) -> np.ndarray:
     return stripe.lines[(stripe.lines >= first) & (stripe.lines < first + count)]
 
 
-@dataclass(frozen=True)
-class ResidualList:
-    """A list of residuals of a calibration (None if missing), and the images to which they belong."""
-
-    group: str
-    name: str
-    values: tuple[float | None, ...]
-    images: tuple[str, ...]
-
-
-def residual_lists(calibration: Calibration) -> list[ResidualList]:
-    """Return all lists of residuals long enough to be drawn, without matrices."""
-    found = []
-    for group, name, value in entries_of(calibration.residuals_in_file()):
-        values = number_list(value) or ()
-        if len(values) > SHORT_LIST and any(each is not None for each in values):
-            images = calibration.figures(group).get("images")
-            names = [image for image in images if isinstance(image, str)] if isinstance(images, list) else []
-            found.append(ResidualList(group, name, tuple(values), tuple(names) if len(names) == len(values) else ()))
-    return found
-
-
 @check_arguments
-def residuals(calibration: Calibration, ax: Axes | None = None, *, which: ResidualList | None = None) -> Axes:
-    """Draw one list of a calibration's residuals by image: ``which``, or the first one of `residual_lists`.
+def residuals(calibration: Calibration, ax: Axes | None = None, *, which: str | None = None) -> Axes:
+    """Draw one list of a calibration's residuals by image.
+
+    Parameters
+    ----------
+    calibration
+        The calibration.
+    ax
+        Axes to draw into.
+    which
+        Step and name of the list, such as "camera.image_rms_px"; by default the first one with more than three numbers.
 
     Raises
     ------
     NothingToDrawError
-        The calibration does not contain a list of residuals.
+        The calibration does not contain this list, or none.
     """
-    which = which or next(iter(residual_lists(calibration)), None)
-    if which is None:
+    lists = {
+        f"{group}.{name}": values
+        for group, name, value in _entries_of(calibration.residuals_in_file())
+        if len(values := number_list(value) or ()) > _SHORT_LIST and any(each is not None for each in values)
+    }
+    if which is None and not lists:
         raise NothingToDrawError("the calibration stores no list of residuals")
+    which = which or next(iter(lists))
+    if which not in lists:
+        raise NothingToDrawError(f"the calibration stores no list of residuals {which}; it has {', '.join(lists)}")
+    (group, _, name), values = which.rpartition("."), lists[which]
+    stored = calibration.figures(group).get("images")
+    images = [image for image in stored if isinstance(image, str)] if isinstance(stored, list) else []
+    images = images if len(images) == len(values) else []
     ax = _axes(ax)
-    places = np.arange(1, len(which.values) + 1)
-    heights = np.array([np.nan if value is None else value for value in which.values])
+    places = np.arange(1, len(values) + 1)
+    heights = np.array([np.nan if value is None else value for value in values])
     if np.nanmin(heights) > 0 and np.nanmax(heights) < _FLAT * np.nanmin(heights):
         ax.plot(places, heights, "o", color=BLUE, markersize=5)
     else:
         ax.bar(places, heights, color="#7fa6cc")
         ax.axhline(0, color=INK, linewidth=0.8)
-    words, unit = split_name(which.name), unit_of(which.name)
+    stem, _, ending = name.rpartition("_")
+    unit = _UNITS.get(ending, "") if stem else ""
+    words = (stem if unit else name).replace("_", " ")
     ax.set(
-        xlabel="image" if which.images or "image" in which.name else "number",
+        xlabel="image" if images or "image" in name else "number",
         ylabel=plain_text(f"{words} / {unit}" if unit else words),
     )
-    if which.images:
-        names = [plain_text(name) for name in which.images]
-        ax.set_xticks(places, names, rotation=40, ha="right", rotation_mode="anchor", fontsize=7)
+    if images:
+        ax.set_xticks(
+            places, list(map(plain_text, images)), rotation=40, ha="right", rotation_mode="anchor", fontsize=7
+        )
     return ax
+
+
+def _entries_of(table: Mapping[str, Any], group: str = "") -> Iterator[tuple[str, str, Any]]:
+    """Iterate over group, name and value of the entries of nested tables; a group is the names of its tables."""
+    for name, value in table.items():
+        if isinstance(value, dict):
+            yield from _entries_of(value, f"{group} {name}".strip())
+        else:
+            yield group, name, value
 
 
 def _axes(ax: Axes | None, *size: float) -> Axes:

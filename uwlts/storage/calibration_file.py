@@ -7,12 +7,14 @@ from pydantic import AwareDatetime
 
 from uwlts.files.json_files import read_json, read_model, write_model
 from uwlts.files.reading import is_regular_file
-from uwlts.model.any_calibration import AnyCalibration, calibration_digest
-from uwlts.model.calibration import FORMAT, VERSION, Calibration
-from uwlts.model.polynomial_calibration import (
-    FORMAT as POLYNOMIALS_FORMAT,
-    VERSION as POLYNOMIALS_VERSION,
+from uwlts.model.calibration import (
+    FORMAT,
+    POLYNOMIALS_FORMAT,
+    VERSION,
+    AnyCalibration,
+    Calibration,
     PolynomialCalibration,
+    calibration_digest,
 )
 from uwlts.model.sensor import Description
 
@@ -26,7 +28,7 @@ def load_calibration(path: str | Path) -> AnyCalibration:
     """Read a calibration of any kind; raises CaptureError if the file is missing, foreign, newer or damaged."""
     if read_json(path, called="calibration", check_seal=False).get("format") != POLYNOMIALS_FORMAT:
         return read_calibration(path)
-    known = {"file_format": POLYNOMIALS_FORMAT, "version": POLYNOMIALS_VERSION, "called": "polynomial calibration"}
+    known = {"file_format": POLYNOMIALS_FORMAT, "version": VERSION, "called": "polynomial calibration"}
     return read_model(path, PolynomialCalibration, **known)
 
 

@@ -32,9 +32,8 @@ from uwlts.argument_types import check_arguments
 from uwlts.errors import CaptureError, ImageError
 from uwlts.files.reading import require_regular_file
 from uwlts.files.writing import hash_file
-from uwlts.model.calibration import is_rigid
 from uwlts.model.joint_estimate import CaptureSource
-from uwlts.model.sensor import Camera, CaptureHeader, Table
+from uwlts.model.sensor import Camera, CaptureHeader, Table, is_rigid
 from uwlts.model.stripe import ROWS, Stripe, StripeStatus
 from uwlts.storage.hdf5_file import (
     DAMAGE,

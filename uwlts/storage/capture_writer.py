@@ -15,8 +15,7 @@ import numpy as np
 from uwlts.errors import CaptureError, ImageError, OutputError
 from uwlts.files.json_files import describe_differences
 from uwlts.files.writing import refuse_unsuitable
-from uwlts.model.calibration import is_rigid
-from uwlts.model.sensor import CaptureHeader, Table
+from uwlts.model.sensor import CaptureHeader, Table, is_rigid
 from uwlts.model.stripe import ROWS, Stripe, stack_rows
 from uwlts.storage.capture import (
     CAPTURES,

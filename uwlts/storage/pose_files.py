@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from uwlts.errors import DescriptionError
 from uwlts.files.reading import log_warnings
 from uwlts.files.writing import write_atomically
-from uwlts.model.calibration import is_rigid
+from uwlts.model.sensor import is_rigid
 from uwlts.model.trajectory import COVARIANCE_COLUMNS, Trajectory
 from uwlts.storage.number_tables import ROTATION_NAMES, NumberTable, Unit, read_number_table
 from uwlts.storage.ros_messages import read_bag_poses

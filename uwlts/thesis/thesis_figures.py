@@ -12,9 +12,8 @@ from uwlts.calibration.capture_evidence import step_evidence
 from uwlts.calibration.sequential.step_images import StepImage, label_step, solve_window
 from uwlts.errors import CalibrationError, RangeError
 from uwlts.evaluation.artefact_figures import evaluate_spheres
-from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.artefacts import SphereStandard
-from uwlts.model.calibration import Calibration, WindowModel
+from uwlts.model.calibration import AnyCalibration, Calibration, WindowModel
 from uwlts.model.sensor import Medium
 from uwlts.model.stripe import stack_pixels
 from uwlts.optics.nominal import nominal_calibration

@@ -25,7 +25,7 @@ from uwlts.errors import ArgumentError, CaptureError, DescriptionError, DesignEr
 from uwlts.files.json_files import json_text
 from uwlts.files.writing import hash_file
 from uwlts.model.library import load_sensor
-from uwlts.radiometry.image_sets import open_image_set
+from uwlts.radiometry.stripe_windows import open_image_set
 from uwlts.storage.data_set import Split
 
 SMALL = {"camera": {"width_px": 160, "height_px": 128, "pixel_size_um": 42.4}}

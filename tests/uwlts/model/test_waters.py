@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from pydantic import ValidationError
 
-from uwlts.errors import DescriptionError, RangeError
+from uwlts.errors import RangeError
 from uwlts.model import media
 from uwlts.model.phase_functions import (
     KINDS,
@@ -100,7 +100,7 @@ TABLE_3 = {
 def test_every_row_of_a_types_scattering_follows_the_authors_model(name):
     small, large = TABLE_3[name]
     wavelengths = np.array(NODES_NM, float)
-    found = np.array([media.find_water(f"jerlov-{name}").particles(w).scattering_per_m for w in wavelengths])
+    found = np.array([media.WATERS[f"jerlov-{name}"].particles(w).scattering_per_m for w in wavelengths])
     # Eq. 8 less the molecules. The amount is met to 2.4 % in the worst case, 1C. The wavelengths' rounding to three
     # digits, 0.5 % at 1.06 /m, is what a misread digit would stand out of.
     model = small * 1.513 * (400 / wavelengths) ** 1.7 + large * 0.3411 * (400 / wavelengths) ** 0.3
@@ -262,15 +262,10 @@ def test_contradictory_entries_are_refused(wrong, message):
 @pytest.mark.parametrize("water", [name for name in media.WATERS if name != "pure"])
 def test_waters_are_refused_outside_their_wavelengths(water, wavelength):
     with pytest.raises(RangeError, match="wavelength_nm"):
-        media.find_water(water).particles(wavelength)
+        media.WATERS[water].particles(wavelength)
 
 
-def test_names_and_turbidities_are_checked_where_they_are_used():
-    with pytest.raises(DescriptionError, match="harbour"):
-        media.find_water("muddy").particles(635.0)
-    for turbidity in (-1e-9, 3.001, math.nan):
-        with pytest.raises(RangeError, match="turbidity"):
-            media.particles_at(turbidity, wavelength_nm=635.0)
+def test_shares_scattered_backwards_are_checked_where_they_are_used():
     for share in (0.9e-4, 0.11, math.nan):
         with pytest.raises(RangeError, match="backscatter_share"):
             FournierForand.of_backscatter(share)

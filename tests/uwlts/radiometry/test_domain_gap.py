@@ -10,8 +10,7 @@ import pytest
 import uwlts
 from uwlts.errors import CaptureError, DescriptionError, ImageError
 from uwlts.radiometry.domain_gap import _set_gap
-from uwlts.radiometry.image_sets import open_image_set
-from uwlts.radiometry.stripe_windows import STATISTICS, StripeWindows, measure_windows
+from uwlts.radiometry.stripe_windows import STATISTICS, StripeWindows, measure_windows, open_image_set
 
 ETNA = Path(__file__).resolve().parents[2] / "data" / "etna"
 NAMES = [each.name for each in STATISTICS]

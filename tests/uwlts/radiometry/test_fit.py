@@ -14,8 +14,9 @@ import uwlts
 from uwlts.model.phase_functions import FournierForand, HenyeyGreenstein, PetzoldAverage, PhaseFunction
 from uwlts.radiometry.fit import _NAMES, _OTHER_PHASES, _Evidence, _natural_absorption
 from uwlts.radiometry.followed_sensor import follow_sensor
-from uwlts.radiometry.scattering import STEP_PX, HaloKernel
+from uwlts.radiometry.result import format_value
 from uwlts.radiometry.stripe_images import BLOCKS, GROUP_LINES, TAIL_PX, StripeImages
+from uwlts.radiometry.stripe_light import STEP_PX, HaloKernel
 
 NODES = np.array([0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.6, 1.0, 2.0, 6.0])
 B, C, BACKGROUND, WIDTH, GROUPS = 0.3, 0.9, 70.0, 21, 400
@@ -66,7 +67,7 @@ def draw(rng: np.random.Generator, phase: PhaseFunction = PETZOLD, known: PhaseF
     fitted = [np.repeat(each[None], BLOCKS, axis=0) for each in halos(known)]
     return _Evidence(
         images=images, sheet_per_px=np.ones(BLOCKS), blur_var=np.zeros(BLOCKS), model=model, fan=fan, paths=paths,
-        distance_mm=400.0, path_mm=750.0, dark_e=0.0, nodes=NODES,
+        distance_mm=400.0, path_mm=750.0, dark_e=0.0,
         tails=CubicSpline(NODES, fitted[0], axis=1), within=CubicSpline(NODES, fitted[1], axis=1),
     )  # fmt: skip
 
@@ -165,3 +166,9 @@ def test_description_keeps_what_is_not_determined():
     assert water.extinction_per_mm(sensor.laser.wavelength_nm) == pytest.approx(0.9e-3)
     described = sensor.medium("water").scattering_per_mm(sensor.laser.wavelength_nm)
     assert water.scattering_per_m == pytest.approx(1e3 * described)
+
+
+def test_values_have_the_digits_of_their_uncertainty():
+    assert format_value(0.83214, 0.0143) == "0.832 ± 0.014"
+    assert format_value(1234.5, 25.0) == "1234 ± 25"
+    assert format_value(1.0, 0.0) == "1"

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.integrate import quad
 
 from uwlts.model.phase_functions import HenyeyGreenstein
-from uwlts.radiometry.scattering import STEP_PX, HaloKernel, line_spread
+from uwlts.radiometry.stripe_light import STEP_PX, HaloKernel, line_spread
 
 
 def test_line_spread_of_isotropic_scattering():

@@ -9,7 +9,7 @@ import pytest
 
 from uwlts.errors import CaptureError
 from uwlts.model.stripe import CaptureStripes
-from uwlts.radiometry.stripe_images import fill_gaps, measure_noise, measure_stripes
+from uwlts.radiometry.stripe_images import CameraNoise, fill_gaps, measure_noise, measure_stripes
 from uwlts.runtime.progress import ignore_progress
 
 GAIN, DARK_DN, BLACK = 0.4, 6.0, 60.0
@@ -42,6 +42,12 @@ def drawn(count: int, rng: np.random.Generator) -> DrawnCapture:
     return DrawnCapture(images, np.zeros(count))
 
 
+def noise_of(scan: DrawnCapture) -> CameraNoise:
+    found = measure_noise(cast(Any, scan))
+    assert found is not None
+    return found
+
+
 def stripes_on(lines: np.ndarray) -> CaptureStripes:
     ones = np.ones(len(lines))
     return CaptureStripes(np.zeros(len(lines), int), lines, 2.0 * lines, ones, ones, lines_by_status={})
@@ -53,9 +59,7 @@ def test_photon_transfer_of_repeated_images_with_grains():
     Some 12,000 lit pixels in 6 images give the gain to sqrt(2 / 60,000) = 0.6 %: five times this is 3 %. 40,000 dark
     pixels give the noise to 0.2 %. The foot of the stripe is in the bin of the dark pixels and adds up to 2 %.
     """
-    scan: Any = drawn(6, np.random.default_rng(5))
-    found = measure_noise(scan)
-    assert found is not None
+    found = noise_of(drawn(6, np.random.default_rng(5)))
     assert abs(found.gain / GAIN - 1) < 0.03
     assert abs(found.gain - GAIN) < 5 * found.gain_std
     assert abs(found.dark_dn / DARK_DN - 1) < 0.02
@@ -67,9 +71,7 @@ def test_unsteady_laser_contradicts_the_photon_transfer():
     scan = drawn(6, np.random.default_rng(10))
     power = np.array([0.98, 1.02, 0.98, 1.02, 0.98, 1.02])[:, None, None]
     scan.images = np.rint(BLACK + power * (scan.images - BLACK)).astype(np.uint16)
-    found = measure_noise(cast(Any, scan))
-    assert found is not None
-    assert found.fit.misfit > 1
+    assert noise_of(scan).fit.misfit > 1
 
 
 def test_shot_noise_of_the_halo_is_not_noise_in_the_dark():
@@ -82,8 +84,7 @@ def test_shot_noise_of_the_halo_is_not_noise_in_the_dark():
     electrons = 6000.0 * np.exp(-0.5 * ((row - 130) / 8.0) ** 2) + 30.0 * (row > 66)
     light = GAIN * rng.poisson(np.broadcast_to(electrons, (200, 300)), (6, 200, 300))
     images = np.rint(BLACK + light + rng.normal(0, DARK_DN, light.shape)).astype(np.uint16)
-    found = measure_noise(cast(Any, DrawnCapture(images, np.zeros(6))))
-    assert found is not None
+    found = noise_of(DrawnCapture(images, np.zeros(6)))
     assert abs(found.dark_dn / DARK_DN - 1) < 0.015
     assert abs(found.dark_dn - DARK_DN) < 3 * found.dark_std < 0.6
 
@@ -110,8 +111,7 @@ def test_moving_particles_change_neither_gain_nor_noise():
     for image in scan.images:
         for place in rng.uniform(0, [200, 300], (16, 2)):
             image[np.hypot(v - place[0], u - place[1]) < 6.0] += 400
-    found = measure_noise(cast(Any, scan))
-    assert found is not None
+    found = noise_of(scan)
     assert abs(found.gain / GAIN - 1) < 0.05
     assert abs(found.dark_dn / DARK_DN - 1) < 0.04
 

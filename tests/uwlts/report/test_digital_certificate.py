@@ -152,6 +152,10 @@ def certificate(**changes):
     return JointCertificate.model_validate(content | changes)
 
 
+def root_of(administration, **changes):
+    return ET.fromstring(digital_certificate(certificate(**changes), load_administration(administration)).encode())
+
+
 def check_order(element):
     """Check an element and all below it against the schema's order and required elements; return their number."""
     name = element.tag.partition("}")[2]
@@ -188,7 +192,7 @@ def quantities(root):
 
 
 def test_elements_have_the_order_of_the_schema(administration):
-    root = ET.fromstring(digital_certificate(certificate(), load_administration(administration)).encode())
+    root = root_of(administration)
     assert root.tag == f"{{{DCC}}}digitalCalibrationCertificate"
     assert root.get("schemaVersion") == "3.2.0"
     assert check_order(root) > 200
@@ -198,7 +202,7 @@ def test_elements_have_the_order_of_the_schema(administration):
 
 
 def test_values_are_those_of_the_certificate(administration):
-    root = ET.fromstring(digital_certificate(certificate(), load_administration(administration)).encode())
+    root = root_of(administration)
     found = quantities(root)
     assert found["f (f) in pixels"] == [(2440.01, r"\one", 0.36)]
     assert found["stage_scale (stage_scale)"] == [(0.0, r"\micro\metre\metre\tothe{-1}", 100.0)]
@@ -225,6 +229,9 @@ def test_digits_are_those_of_the_uncertainty(seed):
     assert _decimal(1.52, None) == "1.52"
 
 
+CIRCLES, STEP = {"target": {"kind": "circles"}}, {"step_captures": [{}]}
+
+
 def statement(root):
     """Return whether the certificate is traceable, and the sentence."""
     first = root.find(f".//{{{DCC}}}statement")
@@ -234,25 +241,16 @@ def statement(root):
 @pytest.mark.parametrize(
     ("stated", "used", "expected"),
     [
-        (TRACEABLE + ADMINISTRATION + EQUIPMENT, {"target": {"kind": "circles"}}, ("true", "By DAkkS D-K-1 to the SI")),
-        (ADMINISTRATION + EQUIPMENT, {"target": {"kind": "circles"}}, ("false", "no statement of traceability")),
-        (
-            TRACEABLE + ADMINISTRATION + EQUIPMENT,
-            {"step_captures": [{}]},
-            ("false", "no certificate of the step standard"),
-        ),
+        (TRACEABLE + ADMINISTRATION + EQUIPMENT, CIRCLES, ("true", "By DAkkS D-K-1 to the SI")),
+        (ADMINISTRATION + EQUIPMENT, CIRCLES, ("false", "no statement of traceability")),
+        (TRACEABLE + ADMINISTRATION + EQUIPMENT, STEP, ("false", "no certificate of the step standard")),
         (TRACEABLE + ADMINISTRATION, {"target": {}}, ("false", "no certificate of the thermometer")),
-        (
-            TRACEABLE + ADMINISTRATION,
-            {"target": {"kind": "circles"}},
-            ("false", "the target, no certificate of the th"),
-        ),
+        (TRACEABLE + ADMINISTRATION, CIRCLES, ("false", "the target, no certificate of the th")),
     ],
 )
 def test_traceability_needs_a_statement_and_a_certificate_of_all_equipment(administration, stated, used, expected):
     administration.write_text(stated, encoding="utf-8")
-    content = certificate(made_from=used)
-    root = ET.fromstring(digital_certificate(content, load_administration(administration)).encode())
+    root = root_of(administration, made_from=used)
     check_order(root)
     traceable, sentence = statement(root)
     assert traceable == expected[0] and expected[1] in sentence
@@ -260,7 +258,7 @@ def test_traceability_needs_a_statement_and_a_certificate_of_all_equipment(admin
 
 def test_equipment_and_kinds_of_quantities_are_marked(administration):
     administration.write_text(ADMINISTRATION + EQUIPMENT, encoding="utf-8")
-    root = ET.fromstring(digital_certificate(certificate(), load_administration(administration)).encode())
+    root = root_of(administration)
     equipment = list(root.iter(f"{{{DCC}}}measuringEquipment"))
     assert [each.get("refType") for each in equipment] == ["basic_measurementStandard"] * 2
     texts = [each.text for each in root.iter()]
@@ -358,7 +356,7 @@ def test_all_units_of_parameters_are_known():
 def test_an_unknown_unit_is_refused(administration):
     row = ParameterRow(name="a", words="a", unit="furlong", value=1.0, std=None, std_before=None)
     with pytest.raises(EvaluationError, match="the unit 'furlong' of a"):
-        digital_certificate(certificate(parameters=(row,)), load_administration(administration))
+        root_of(administration, parameters=(row,))
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from matplotlib.colors import to_hex
 from uwlts.model.library import load_sensor
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.pages.cloud_display import choose_points
+from uwlts.pages.cloud_figure import colour_limit_mm
 from uwlts.pages.toolkit import figure_png, figure_svg, format_fixed, format_to_scale
 from uwlts.report import plot
 from uwlts.storage.cloud import PointCloud
@@ -59,13 +60,11 @@ def test_plots_have_units_on_their_axes():
     points, nothing = np.column_stack([0 * y, y, 0 * y]), np.zeros(len(y), int)
     cloud = PointCloud(points, nothing, nothing, nothing, deviation_mm=0.01 * np.sin(y))
     calibration = nominal_calibration(load_sensor("thesis")).model_copy(update={"residuals": RESIDUALS})
-    lists = plot.residual_lists(calibration)
-    assert [(each.group, each.name) for each in lists] == [
-        ("camera", "image_rms_px"),
-        ("window", "errors_mm"),
-        ("window", "image_distances_mm"),
-    ]
+    lists = ["camera.image_rms_px", "window.errors_mm", "window.image_distances_mm"]
     flat = [plot.residuals(calibration, which=each) for each in lists]
+    assert plot.residuals(calibration).get_ylabel() == flat[0].get_ylabel() == "image rms / px"
+    with pytest.raises(plot.NothingToDrawError, match=f"it has {', '.join(lists)}"):
+        plot.residuals(calibration, which="camera.covariance")
     counts = {"image", ""}
     titles = [title for ax in flat for title in (ax.get_xlabel(), ax.get_ylabel())]
     assert all(title in counts or title.split(" / ")[-1] in ("mm", "µm", "px") for title in titles)
@@ -173,7 +172,7 @@ def test_colours_are_symmetric_and_end_at_the_limit():
     shown = plot.DEVIATIONS(np.array([-2.0, 0.0, 0.5, 1.0, 4.0]))
     assert shown[0].tolist() == shown[1].tolist() and shown[3].tolist() == shown[4].tolist()
     assert shown[0][2] > shown[0][0] and shown[3][0] > shown[3][2] and np.ptp(shown[2, :3]) < 0.03
-    assert plot.colour_limit_mm(np.array([-0.01, 0.01, np.nan])) == pytest.approx(0.02)
+    assert colour_limit_mm(np.array([-0.01, 0.01, np.nan])) == pytest.approx(0.02)
     points, nothing = np.arange(9.0).reshape(3, 3), np.zeros(3, int)
     cloud = PointCloud(points, nothing, nothing, nothing, deviation_mm=np.array([-0.01, 0.01, np.nan]))
     unknown, known = plot.cloud(cloud).collections

@@ -8,7 +8,7 @@ import pytest
 import uwlts
 from tests.uwlts.reconstruction.test_moving import record
 from tests.uwlts.reconstruction.test_reconstruct import CALIBRATION
-from uwlts.model.any_calibration import calibration_digest
+from uwlts.model.calibration import calibration_digest
 from uwlts.reconstruction.verify import Verdict, Verification
 from uwlts.storage.calibration_file import describe_verification
 

@@ -26,8 +26,7 @@ from uwlts.calibration.joint.stored_estimate import (
 )
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, sources_of
 from uwlts.errors import CalibrationError, RangeError
-from uwlts.model.any_calibration import calibration_digest
-from uwlts.model.calibration import Calibration, KnownStage
+from uwlts.model.calibration import Calibration, KnownStage, calibration_digest
 from uwlts.model.joint_estimate import CoveredRegion, JointEstimate, Origin
 from uwlts.model.parameter_keys import MediumIndex
 from uwlts.model.sensor import Medium

@@ -9,8 +9,7 @@ import numpy as np
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, read_stored_estimate
 from uwlts.calibration.mount.restricted_likelihood import RestrictedEstimate
 from uwlts.errors import CalibrationError, DescriptionError
-from uwlts.model.any_calibration import calibration_digest
-from uwlts.model.calibration import Calibration
+from uwlts.model.calibration import Calibration, calibration_digest
 from uwlts.model.mount import SensorShare
 from uwlts.optics.fitness import check_fits
 from uwlts.optics.triangulation import reconstruct_profile

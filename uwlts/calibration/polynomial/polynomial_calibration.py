@@ -19,8 +19,8 @@ from uwlts.calibration.camera.camera_parameters import TargetImage
 from uwlts.calibration.capture_evidence import AirEvidence, find_air_evidence
 from uwlts.errors import CalibrationError, RangeError
 from uwlts.fitting.least_squares import DEFAULT_K, robust_std
+from uwlts.model.calibration import PolynomialCalibration
 from uwlts.model.placement import laser_pose
-from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.model.short_text import Brief
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.triangulation import reconstruct_pixels

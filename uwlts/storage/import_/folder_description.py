@@ -9,8 +9,8 @@ from pydantic import Field, model_validator
 from uwlts.errors import DescriptionError
 from uwlts.files.reading import MOST_JSON_BYTES, is_regular_file, parse_json, read_text
 from uwlts.model.artefacts import parse_artefact
-from uwlts.model.inheritance import Level
 from uwlts.model.library import (
+    Level,
     find_description,
     load_sensor,
     merge_tables,

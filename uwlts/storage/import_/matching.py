@@ -12,7 +12,7 @@ import numpy as np
 
 from uwlts.errors import DescriptionError, ImageError
 from uwlts.files.reading import is_regular_file, natural_key, read_text
-from uwlts.model.calibration import is_rigid
+from uwlts.model.sensor import is_rigid
 from uwlts.storage.capture import NO_STAGE, POSE_ROUNDED
 from uwlts.storage.image_file import SUFFIXES
 from uwlts.storage.import_.folder_description import ImportDescription, Patterns

@@ -21,7 +21,7 @@ from uwlts.calibration.mount.restricted_likelihood import RestrictedEstimate, so
 from uwlts.calibration.sequential.sheet_fit import object_frame
 from uwlts.errors import DescriptionError
 from uwlts.fitting.next_observation import CovarianceRoot
-from uwlts.model.any_calibration import calibration_digest
+from uwlts.model.calibration import calibration_digest
 from uwlts.model.sensor import Medium
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.reconstruction.moving import PlatformPoses, add_platform_uncertainty

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from uwlts.errors import DescriptionWarning
-from uwlts.model.inheritance import Level, find_misfits
-from uwlts.model.library import list_names, load_sensor
+from uwlts.model.library import Level, find_misfits, list_names, load_sensor
 
 OWN = 'name = "mine"\nnotes = "a sensor of its own"\n'
 
