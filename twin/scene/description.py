@@ -121,13 +121,6 @@ class PrintedPlate(SceneObject, ABC):
     def ink_and_gap_reflectance(self) -> tuple[float, float]:
         """Return the reflectance of printed patches with ink and of patches without."""
 
-    def scale_reflectance(self, scale: float) -> Self:
-        """Return the plate with all reflectances multiplied by ``scale``."""
-        own = set(type(self).model_fields) - set(SceneObject.model_fields)
-        printed = {name: getattr(self, name) for name in own if name.endswith("_reflectance")}
-        values = printed | {"reflectance": self.background_reflectance()}
-        return self.model_copy(update={name: scale * value for name, value in values.items()})
-
     def background_reflectance(self) -> float:
         """Return the reflectance of the plate around the print."""
         return self.finish_properties().reflectance
