@@ -202,7 +202,7 @@ class Bench:
         began, known, travel = time.perf_counter(), len(self._seen), None
         if state is not None and state.moving and self._studio.options.effects.motion:
             velocity = state.speed_mm_per_s * self._track.motion.unit_direction()
-            travel = self._studio.travel_at(velocity, exposure_ms=exposure_ms)
+            travel = self._studio.travel_at(velocity, np.zeros(3), exposure_ms=exposure_ms)
         state = state or self._state()
         if travel is not None:
             self._seen.clear()

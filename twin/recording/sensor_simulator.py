@@ -1,6 +1,6 @@
 """Simulation of a sensor in a scene: poses, exposures, noisy images, and the ground truth of each shot."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from typing import Literal, TypeAlias
 
@@ -178,33 +178,29 @@ class SensorSimulator:
         """Return ``T_scene_object`` (4, 4) of the sensor's OCS at a shot, in the middle of its exposure."""
         return self.scene.motion.pose(shot)
 
-    def travel(self, shot: Shot) -> Travel | None:
-        """Return the motion of the sensor during the exposure of a shot; None if it does not move."""
-        if not (self.scene.motion.moves() and self.options.effects.motion):
+    def travel(self, shot: Shot, *, in_water: bool = False) -> Travel | None:
+        """Return the motion of the sensor in the scene, or relative to the water, during the exposure of a shot.
+
+        None if it does not move.
+        """
+        motion, current = self.scene.motion, in_water * np.array(self.scene.current_mm_per_s)
+        if not self.options.effects.motion or not (motion.moves() or current.any()):
             return None
-        exposure_ms = self._exposure_of(shot)
-        return self.travel_at(*self.scene.motion.twist(shot, exposure_s=1e-3 * exposure_ms), exposure_ms=exposure_ms)
+        exposure_ms, velocity, turn = self._exposure_of(shot), np.zeros(3), np.zeros(3)
+        if motion.moves():
+            velocity, turn = motion.twist(shot, exposure_s=1e-3 * exposure_ms)
+        return self.travel_at(velocity - current, turn, exposure_ms=exposure_ms)
 
     def _exposure_of(self, shot: Shot) -> float:
         """Return the exposure time of a shot in ms."""
         return self.exposure_ms[shot.light] * shot.exposure
 
-    def through_water(self, shot: Shot) -> Travel | None:
-        """Return the motion of the sensor relative to the water during an exposure; None if it does not move."""
-        travel, current = self.travel(shot), np.array(self.scene.current_mm_per_s)
-        if not (self.options.effects.motion and current.any()):
-            return travel
-        if travel is None:
-            return self.travel_at(-current, exposure_ms=self._exposure_of(shot))
-        return replace(travel, velocity_mm_s=travel.velocity_mm_s - current)
-
-    def travel_at(self, *twist: np.ndarray, exposure_ms: float) -> Travel:
-        """Return a motion of the sensor during an exposure: its velocity in mm/s, and a rotation rate in rad/s."""
+    def travel_at(self, velocity_mm_s: np.ndarray, turn_rad_s: np.ndarray, *, exposure_ms: float) -> Travel:
+        """Return a motion of the sensor during an exposure."""
         detector = self.sensor.detector
         row_s = 1e-6 * detector.line_time_us if detector.shutter == "rolling" else 0.0
         middle_row = (self.sensor.camera.height_px - 1) / 2
-        velocity, *turn = twist
-        return Travel(velocity, 1e-3 * exposure_ms, *turn, row_s=row_s, middle_row=middle_row)
+        return Travel(velocity_mm_s, 1e-3 * exposure_ms, turn_rad_s, row_s=row_s, middle_row=middle_row)
 
     def electrons_per_ms(self, shot: Shot, *, spp: int, seed: int, travel: Travel | None = None) -> np.ndarray:
         """Return the mean photo-electrons per ms (H, W) of a shot."""
@@ -283,7 +279,7 @@ class SensorSimulator:
             spp=self.options.spp,
             seed=seed,
             travel=self.travel(shot),
-            through_water=self.through_water(shot),
+            through_water=self.travel(shot, in_water=True),
             time_s=self._time_s(shot, index),
             exposure_s=1e-3 * self._exposure_of(shot),
             with_truth=True,

@@ -149,8 +149,8 @@ def test_the_sensor_moves_through_the_water_by_its_own_motion_less_the_current(s
     ):
         scene = scene_of(plate(), motion=moves, current_mm_per_s=current)
         simulator = SensorSimulator(timed, scene, Options(effects=replace(NONE, motion=True)))
-        travel = simulator.through_water(next(scene.motion.shots()))
+        travel = simulator.travel(next(scene.motion.shots()), in_water=True)
         assert travel is not None and travel.exposure_s == pytest.approx(8e-3)
         np.testing.assert_allclose(travel.velocity_mm_s, expected)
         still = SensorSimulator(timed, scene, Options(effects=NONE))
-        assert still.through_water(next(scene.motion.shots())) is None
+        assert still.travel(next(scene.motion.shots()), in_water=True) is None
