@@ -188,18 +188,9 @@ class Renderer:
     ) -> np.ndarray:
         """Return the irradiance (H, W) of lamp or daylight on the image sensor in W/mm2, float32.
 
-        Parameters
-        ----------
-        light
-            "day" is daylight with laser and lamp off.
-        scene_from_object : (4, 4)
-            Pose of the OCS in the scene.
-        spp
-            Number of samples per lit pixel, at the same positions in every pixel.
-        travel
-            Motion of the sensor during the exposure; None: at rest.
-        time_s, exposure_s
-            Time and duration of the exposure, for the waves of the water surface.
+        ``scene_from_object`` (4, 4) is the pose of the OCS in the scene, and ``travel`` the motion of the sensor during
+        the exposure; None: at rest. Each lit pixel has ``spp`` samples, at the same positions in every pixel. Waves of
+        the water surface depend on time and duration of the exposure.
         """
         if light == "day" and not (self.effects.ambient and self.sensor.lamp.ambient_w_per_m2 > 0):
             return np.zeros(self._size, np.float32)

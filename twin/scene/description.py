@@ -280,20 +280,10 @@ def load_scene(
     water: str | float | None = None,
     motion: Motion | Platform | Mapping[str, object] | None = None,
 ) -> Scene:
-    """Read a scene by name or path; the given values replace its own.
+    """Read a scene by the name of a shipped one (``spheres``) or by path; the given values replace its own.
 
-    Parameters
-    ----------
-    name_or_path
-        Name of a shipped scene (``spheres``), or path of a description.
-    placement
-        Name of one of the scene's placements.
-    medium
-        Name of one of the sensor's media.
-    water
-        Name of a water, or a turbidity from 0 (pure) to 3 (harbour).
-    motion
-        Motion of the sensor; a table is validated like one of the file.
+    They are the names of one of the scene's placements and of one of the sensor's media, the name of a water or a
+    turbidity from 0 (pure) to 3 (harbour), and a motion of the sensor. A table is validated like one of the file.
     """
     path = find_description(name_or_path)
     table: dict[str, object] = dict(read_table(path))

@@ -246,6 +246,9 @@ def register_textures() -> None:
         def is_spatially_varying(self) -> bool:
             return True
 
+        def to_string(self) -> str:
+            return f"{type(self).__name__}[]"
+
     class TargetPattern(ExactTexture):
         """Reflectance of a printed plate whose uv coordinates run from 0 to 1 over its bounds.
 

@@ -98,26 +98,16 @@ class Speckle:
         polarisation: ArrayLike,
         coherence: ArrayLike = 1.0,
     ) -> np.ndarray:
-        """Return factors (P,), float32, not negative and of mean 1, of the laser's light in pixels (P,).
+        """Return factors (P,), float32, not negative and of mean 1, of the laser's light in pixels (P,) in any order.
 
-        Parameters
-        ----------
-        rows, columns
-            Pixels (P,) in any order.
-        travel_mm
-            Travel of the stage. See `renewal_correlation` for its effect.
-        polarisation
-            Degree of polarisation P of the scattered light, (P,) or a scalar, 0 to 1: 1 for bare metal, about 0 for
-            paint and plastics, where light is scattered many times. The patterns of two orthogonal polarisations add in
-            intensity, I = (1 + P) / 2 I_1 + (1 - P) / 2 I_2, with the contrast sqrt((1 + P^2) / 2) (Goodman, Speckle
-            Phenomena in Optics, Ch. 3).
-        coherence
-            Contrast of the unintegrated pattern of one polarisation, (P,) or a scalar, 1e-4 to 1 (smaller values are
-            raised); see the function `coherence`. It multiplies the contrast, as averaging over the pixel area does
-            (`pixel_contrast`).
+        ``travel_mm`` is the travel of the stage; see `renewal_correlation` for its effect. ``polarisation`` is the
+        degree of polarisation P of the scattered light, (P,) or a scalar, 0 to 1: 1 for bare metal, about 0 for paint
+        and plastics, where light is scattered many times. The patterns of two orthogonal polarisations add in
+        intensity, I = (1 + P) / 2 I_1 + (1 - P) / 2 I_2, with the contrast sqrt((1 + P^2) / 2) (Goodman, Speckle
+        Phenomena in Optics, Ch. 3). ``coherence`` is the contrast of the unintegrated pattern of one polarisation, (P,)
+        or a scalar, 1e-4 to 1 (smaller values are raised); see the function `coherence`. It multiplies the contrast, as
+        averaging over the pixel area does (`pixel_contrast`).
 
-        Notes
-        -----
         All factors have the same grains. If many patterns add up, the true correlation between pixels is smaller by
         up to a fifth.
         """
@@ -145,17 +135,10 @@ def coherence(roughness_um: ArrayLike, *, linewidth_nm: float, wavelength_nm: fl
     standard deviation d, q has the variance 2 d^2. The mean intensity correlation is C^2 = (1 + 4 (d g s)^2)^(-1/2)
     (Parry in Dainty, Laser Speckle and Related Phenomena, 1975; Goodman, Speckle Phenomena in Optics, Ch. 5).
 
-    Parameters
-    ----------
-    roughness_um
-        Standard deviation of the surface's heights within a resolution cell, of any shape. If light enters the
-        material, give half the standard deviation of its optical path instead, with the index 1.
-    linewidth_nm
-        Full width at half maximum of the laser's spectrum during an exposure, 0 for a coherent laser.
-    wavelength_nm
-        Mean wavelength in air.
-    index
-        Refractive index n of the medium relative to air.
+    ``roughness_um``, of any shape, is the standard deviation of the surface's heights within a resolution cell. If
+    light enters the material, give half the standard deviation of its optical path instead, with the index 1.
+    ``linewidth_nm`` is the full width at half maximum of the laser's spectrum during an exposure, 0 for a coherent
+    laser. ``wavelength_nm`` is the mean one in air, ``index`` the refractive index n of the medium relative to air.
     """
     spread_per_um = 1e3 * 2 * math.pi / wavelength_nm**2 * linewidth_nm / math.sqrt(8 * math.log(2))
     return (1 + 4 * (spread_per_um * index * 2 * np.asarray(roughness_um, float)) ** 2) ** -0.25
