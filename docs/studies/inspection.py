@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 import uwlts
 from twin.scene.description import load_scene
 from twin.scene.forms import Flange, Weld
-from twin.scene.forms.flawed_parts import weld_height
+from twin.scene.forms.parts import weld_height
 from uwlts.inspection.features import Feature, FeatureKind, Inspection
 from uwlts.storage.capture_writer import CaptureWriter
 

@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 import uwlts
 from twin.scene.description import load_scene
 from twin.scene.forms import Flange
-from twin.scene.forms.flange import flange_face
+from twin.scene.forms.parts import flange_face
 
 SEEN_MM = 1.0
 """Largest distance from a vertex to the nearest point; beyond it, the surface was not seen."""

@@ -74,14 +74,14 @@ def rendering() -> list[Row]:
     return [
         at_most(
             "sharp laser frame 1280 x 1024, 64 samples per lit pixel, spheres in water",
-            median_seconds(lambda k: spheres.irradiance("laser", pose(k), spp=64)),
+            median_seconds(lambda k: spheres.laser_frame(pose(k), spp=64).irradiance()),
             "s",
             limit,
             floor,
         ),
         at_most(
             "sharp laser frame 1280 x 1024, 64 samples per lit pixel, pipe across the whole image in water",
-            median_seconds(lambda k: pipe.irradiance("laser", pose(k), spp=64)),
+            median_seconds(lambda k: pipe.laser_frame(pose(k), spp=64).irradiance()),
             "s",
             limit,
             floor,

@@ -44,7 +44,7 @@ def frame_seconds(water: str, samples_at_once: int) -> float:
     renderer = module.Renderer(sensor, sensor.media["water"], load_scene("spheres"))
     for seed in range(WARM_UP + FRAMES):
         start = time.perf_counter()
-        renderer.irradiance("laser", np.eye(4), spp=Options().spp, seed=seed)
+        renderer.laser_frame(np.eye(4), spp=Options().spp, seed=seed).irradiance()
         seconds.append(time.perf_counter() - start)
     return statistics.median(seconds[WARM_UP:])
 
@@ -70,10 +70,10 @@ def light_span(water: str) -> tuple[float, float]:
     sensor = in_named_water(water)
     renderer = Renderer(sensor, sensor.media["water"], load_scene("spheres"))
     for seed in range(WARM_UP):
-        renderer.irradiance("laser", np.eye(4), spp=Options().spp, seed=seed)
+        renderer.laser_frame(np.eye(4), spp=Options().spp, seed=seed).irradiance()
     start = time.time()
     for seed in range(FRAMES):
-        renderer.irradiance("laser", np.eye(4), spp=Options().spp, seed=WARM_UP + seed)
+        renderer.laser_frame(np.eye(4), spp=Options().spp, seed=WARM_UP + seed).irradiance()
     return start, time.time()
 
 

@@ -71,7 +71,7 @@ def rendered_light(water: str) -> tuple[float, float]:
     images, seconds = [], []
     for seed in range(SEEDS + 2):
         start = time.perf_counter()
-        images.append(renderer.irradiance("laser", np.eye(4), spp=SPP, seed=seed))
+        images.append(renderer.laser_frame(np.eye(4), spp=SPP, seed=seed).irradiance())
         seconds.append(time.perf_counter() - start)
     kept = np.stack(images[2:])
     noise = stripe_noise(kept, kept.mean(axis=0)) * np.sqrt(SEEDS / (SEEDS - 1))
@@ -98,12 +98,12 @@ def equal_noise_advantage() -> tuple[float, str]:
     effects = replace(NONE, haze=True, multiple_scattering=True, secondary_light=True)
     renderer = Renderer(sensor, medium, scene, effects=effects)
     for seed in range(2):
-        renderer.irradiance("laser", np.eye(4), spp=STOCK_SPP, seed=seed)
+        renderer.laser_frame(np.eye(4), spp=STOCK_SPP, seed=seed).irradiance()
     start = time.perf_counter()
-    ours = np.stack([renderer.irradiance("laser", np.eye(4), spp=STOCK_SPP, seed=seed) for seed in range(SEEDS)])
+    ours = np.stack([renderer.laser_frame(np.eye(4), spp=STOCK_SPP, seed=seed).irradiance() for seed in range(SEEDS)])
     our_seconds = (time.perf_counter() - start) / SEEDS
     truth = np.mean(
-        [renderer.irradiance("laser", np.eye(4), spp=8 * STOCK_SPP, seed=100 + k) for k in range(8)], axis=0
+        [renderer.laser_frame(np.eye(4), spp=8 * STOCK_SPP, seed=100 + k).irradiance() for k in range(8)], axis=0
     )
     our_noise = stripe_noise(ours, truth)
     stock = stock_scene(thrown, medium, scene, across_texels=64)

@@ -30,25 +30,19 @@ BSDFPtr: TypeAlias = Any
 _ALIGNMENT_BYTES = 64  # a cache line, and the widest vector register
 
 
-def to_jit(kind: type, values: np.ndarray) -> Float:
-    """Return a one-dimensional array as ``mi.Float`` or ``mi.UInt32`` with aligned memory."""
-    dtype = np.dtype(np.float32 if kind is mi.Float else np.uint32)
-    size = values.size * dtype.itemsize
+def to_jit(values: np.ndarray) -> Float:
+    """Return values as one-dimensional ``mi.Float`` with aligned memory."""
+    size = 4 * values.size
     memory = np.empty(size + _ALIGNMENT_BYTES, np.uint8)
     start = -memory.ctypes.data % _ALIGNMENT_BYTES
-    aligned = memory[start : start + size].view(dtype)
+    aligned = memory[start : start + size].view(np.float32)
     aligned[:] = values.ravel()
-    return kind(aligned)
+    return mi.Float(aligned)
 
 
 def to_numpy(vector: Point3f) -> np.ndarray:
     """Return the components of N vectors as (N, 3)."""
     return np.stack([component.numpy() for component in vector], axis=1)
-
-
-def scalar_transform(matrix: np.ndarray) -> mi.ScalarTransform4f:
-    """Return the transform (4, 4) of a shape fixed in the scene."""
-    return mi.ScalarTransform4f(matrix)
 
 
 def opaque(value: float) -> Float:

@@ -13,13 +13,16 @@ from ctypes import c_char_p, c_double, c_int, c_size_t, c_uint32, c_uint64, c_vo
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType, SimpleNamespace
-from typing import Literal, Protocol, Self
+from typing import TYPE_CHECKING, Literal, Self
 from xml.etree import ElementTree
 
 import numpy as np
 
 from uwlts.errors import HardwareError, ImageError
 from uwlts.runtime.optional_library import load_aravis
+
+if TYPE_CHECKING:
+    from twin.sensor.detector import PeakFinder
 
 # Data rate of 1 Gbit/s.
 _BYTES_PER_S = 125e6
@@ -167,50 +170,22 @@ class ExposedFrame:
     image: Callable[[float], np.ndarray]
 
 
-class Scan3d(Protocol):
-    """Peak finder inside the camera."""
-
-    def scale_px(self) -> float:
-        """Return the size of one step of its numbers in px."""
-        ...
-
-    def numbers(self, image: np.ndarray) -> np.ndarray:
-        """Return a number (L,), uint16, for each profile line of an image (H, W)."""
-        ...
-
-
 class GigeCamera:
     """Server of an 8-bit camera, as a context manager.
 
-    A trigger that arrives during the making of an image replaces the previous trigger, which is not answered.
+    ``frame(exposure_ms)`` returns the whole image (height_px, width_px), uint8; all calls are in the same thread. If it
+    raises an exception, the frame is lost and the exception is kept in ``failure``. A trigger that arrives during the
+    making of an image replaces the previous trigger, which is not answered. Frames are numbered from ``first_number``.
 
-    Parameters
-    ----------
-    frame
-        ``frame(exposure_ms)`` returns the whole image (height_px, width_px), uint8. All calls are in the same thread.
-        If it raises an exception, the frame is lost and the exception is kept in ``failure``.
-    width_px, height_px : int
-        Size of the image.
-    serial : str
-        Serial number.
-    first_number : int
-        Number of the first frame.
-    scan3d : Scan3d, optional
-        Makes it a 3D camera: its pixel format is Coord3D_C16 until a program selects Mono8. Each frame contains the
-        profile of an image, with 0 for no stripe. A free-running camera sends ``Height`` profiles together.
-    encoder : callable, optional
-        Returns the count of an encoder that is wired to the camera. Count and time of each profile are sent as chunk
-        data on request.
-    expose : callable, optional
-        Called in the middle of each exposure of a free-running camera, at its frame rate and with true time stamps.
-        Images are made later and wait in the camera's memory. They are lost at the end of the acquisition.
+    With ``scan3d`` it is a 3D camera: its pixel format is Coord3D_C16 until a program selects Mono8. Each frame
+    contains the profile of an image, with 0 for no stripe. A free-running camera sends ``Height`` profiles together.
+    ``encoder`` returns the count of an encoder that is wired to the camera. Count and time of each profile are sent as
+    chunk data on request.
 
-    Raises
-    ------
-    HardwareError
-        Another camera is served on this machine.
-    SetupError
-        Aravis is not installed.
+    ``expose`` is called in the middle of each exposure of a free-running camera, at its frame rate and with true time
+    stamps. Images are made later and wait in the camera's memory. They are lost at the end of the acquisition.
+
+    HardwareError if another camera is served on this machine; SetupError if Aravis is not installed.
     """
 
     def __init__(
@@ -221,7 +196,7 @@ class GigeCamera:
         height_px: int = 1024,
         serial: str = "1",
         first_number: int = 1,
-        scan3d: Scan3d | None = None,
+        scan3d: "PeakFinder | None" = None,
         encoder: Callable[[], int] | None = None,
         expose: Callable[[], ExposedFrame] | None = None,
     ):
@@ -314,23 +289,26 @@ class GigeCamera:
         library.g_object_set_property(self._server, b"gvsp-lost-ratio", every)
         self._camera = library.arv_gv_fake_camera_get_fake_camera(self._server)
         height, width = self._size
-        texts = ((_Register.MAKER, b"UWLTS", _NAME_BYTES), (_Register.MODEL, b"Twin", _NAME_BYTES))
-        for register, text, room in (*texts, (_Register.DEVICE_ID, self._serial, _SERIAL_BYTES)):
-            library.arv_fake_camera_write_memory(self._camera, register, room, text.ljust(room, b"\0"))
-        for register, number in (
-            (_Register.SENSOR_WIDTH, width),
-            (_Register.WIDTH, width),
-            (_Register.SENSOR_HEIGHT, height),
-            (_Register.HEIGHT, height),
-            (_Register.PACKET_SIZE, _PACKET_BYTES),
-        ):
-            library.arv_fake_camera_write_register(self._camera, register, number)
+        memory = {
+            _Register.MAKER: b"UWLTS".ljust(_NAME_BYTES, b"\0"),
+            _Register.MODEL: b"Twin".ljust(_NAME_BYTES, b"\0"),
+            _Register.DEVICE_ID: self._serial.ljust(_SERIAL_BYTES, b"\0"),
+        }
+        numbers = {
+            _Register.SENSOR_WIDTH: width,
+            _Register.WIDTH: width,
+            _Register.SENSOR_HEIGHT: height,
+            _Register.HEIGHT: height,
+            _Register.PACKET_SIZE: _PACKET_BYTES,
+        }
         if self._scan3d is not None:
-            library.arv_fake_camera_write_register(self._camera, _Register.PIXEL_FORMAT, _COORD3D_C16)
-            scale = self._scan3d.scale_px()
-            places = (_Register.SCAN3D_SCALE, scale), (_Register.SCAN3D_OFFSET, 0.0), (_Register.SCAN3D_INVALID, 0.0)
-            for register, value in places:
-                library.arv_fake_camera_write_memory(self._camera, register, 8, struct.pack(">d", value))
+            numbers[_Register.PIXEL_FORMAT] = _COORD3D_C16
+            memory[_Register.SCAN3D_SCALE] = struct.pack(">d", self._scan3d.scale_px())
+            memory |= dict.fromkeys((_Register.SCAN3D_OFFSET, _Register.SCAN3D_INVALID), struct.pack(">d", 0.0))
+        for register, data in memory.items():
+            library.arv_fake_camera_write_memory(self._camera, register, len(data), data)
+        for register, number in numbers.items():
+            library.arv_fake_camera_write_register(self._camera, register, number)
         library.arv_fake_camera_set_trigger_frequency(self._camera, _LOOKS_FOR_TRIGGER_HZ)
         library.arv_fake_camera_set_fill_pattern(self._camera, self._callback, None)
 

@@ -67,20 +67,9 @@ class LitTime:
 class GrblController:
     """Controller as a context manager, with its own thread; all methods are thread-safe.
 
-    Parameters
-    ----------
-    settings : mapping, optional
-        Grbl settings by number, in place of those in `BENCH_SETTINGS`.
-    position_mm : float
-        Position of the stage when the power is switched on.
-    speed_up : float
-        Factor of the controller's time, except for dwells.
-    resets_when_opened : bool
-        Restart the controller when the port is opened, as the Uno does through DTR.
-    gated : bool
-        Switch the laser's supply off while the port is closed.
-    **build
-        Version, options and boot time, as for `GrblFirmware`.
+    ``settings`` by number replace those in `BENCH_SETTINGS`. ``position_mm``, ``speed_up`` and ``build`` (version,
+    options and boot time) are those of `GrblFirmware`. With ``resets_when_opened`` the controller restarts when the
+    port is opened, as the Uno does through DTR. With ``gated`` the laser's supply is off while the port is closed.
     """
 
     def __init__(

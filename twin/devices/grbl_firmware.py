@@ -71,11 +71,6 @@ def parse_block(line: str) -> CommandBlock:
             raise GrblError(4)
         else:
             values[letter] = number
-    _refuse_incomplete(commands, values, machine_coordinates)
-    return CommandBlock(commands, values, machine_coordinates)
-
-
-def _refuse_incomplete(commands: dict[str, str], values: dict[str, float], machine_coordinates: bool) -> None:
     once, motion = commands.get("once"), commands.get("motion")
     refused = {
         28: once == "G4" and "P" not in values,
@@ -88,6 +83,7 @@ def _refuse_incomplete(commands: dict[str, str], values: dict[str, float], machi
     for code, wrong in refused.items():
         if wrong:
             raise GrblError(code)
+    return CommandBlock(commands, values, machine_coordinates)
 
 
 _DECIMALS = {11, 12, 24, 25, 27, *range(100, 133)}
@@ -104,25 +100,11 @@ _DWELL_STEP_S = 0.05
 class GrblFirmware:
     """Firmware of one controller; not thread-safe.
 
-    Parameters
-    ----------
-    settings : mapping
-        All settings by number.
-    position_mm : float
-        Position of the stage when the power is switched on.
-    clock : callable
-        Returns the controller's time in s.
-    say : callable
-        Receives the bytes for the computer.
-    version : str
-        Version in the greeting.
-    options : str
-        Code letters of the build in ``$I``.
-    boot_s : float
-        Time from a restart to the greeting; default: that of the Uno's boot loader.
-    speed_up : float
-        Factor between the controller's time and real time. Dwells are longer by this factor in the controller's time,
-        because exposures during a dwell take real time.
+    ``settings`` are all settings by number, and ``position_mm`` is the position of the stage when the power is switched
+    on. ``clock`` returns the controller's time in s, and ``say`` receives the bytes for the computer. ``version`` is
+    that of the greeting, ``options`` are the code letters of the build in ``$I``. ``boot_s`` is the time from a restart
+    to the greeting, by default that of the Uno's boot loader. ``speed_up`` is the factor between the controller's time
+    and real time. Dwells are longer by it, because exposures during a dwell take real time.
     """
 
     def __init__(
@@ -142,11 +124,6 @@ class GrblFirmware:
         self.axis = Axis(self._settings[120])
         self.shift_mm, self.short_steps, self._starts = position_mm, 0, 0
         self.restart()
-
-    @property
-    def stage_mm(self) -> float:
-        """True position of the stage."""
-        return self.stage_at(self._now())[0]
 
     def stage_at(self, time_s: float) -> tuple[float, float]:
         """Return the true position in mm and signed speed in mm/s at a time of the controller, now or just before."""
@@ -241,9 +218,12 @@ class GrblFirmware:
                 return
             self._booted_s = None
             self._greet()
-        while not self._critical and (self._job is not None or (self._ready() and not self.axis.held)):
+        while not self._critical:
             if self._job is None:
-                self._job = self._answer(self._next_line())
+                line = None if self.axis.held else self._next_line()
+                if line is None:
+                    return
+                self._job = self._answer(line)
             job = self._job
             try:
                 next(job)
@@ -252,13 +232,13 @@ class GrblFirmware:
                 # An alarm or a reset within the job has already discarded it.
                 self._job = None if self._job is job else self._job
 
-    def _ready(self) -> bool:
-        return b"\n" in self._input or b"\r" in self._input
-
-    def _next_line(self) -> str:
-        end = min(at for at in (self._input.find(b"\n"), self._input.find(b"\r")) if at >= 0)
-        line = self._input[:end].decode("ascii")
-        del self._input[: end + 1]
+    def _next_line(self) -> str | None:
+        """Return the next complete line, without spaces and comments; None if there is none."""
+        ends = [at for at in (self._input.find(b"\n"), self._input.find(b"\r")) if at >= 0]
+        if not ends:
+            return None
+        line = self._input[: min(ends)].decode("ascii")
+        del self._input[: min(ends) + 1]
         return "".join(line.split(";")[0].split()).upper()
 
     def _answer(self, line: str) -> Generator[None, None, None]:
@@ -318,7 +298,6 @@ class GrblFirmware:
         return s * min(speed / self.axis.commanded_speed(now), 1.0) if speed else 0.0
 
     def _wait_until_done(self) -> Generator[None, None, None]:
-        """Wait until all movements are done."""
         while self.axis.pending or self.axis.held:
             yield
 

@@ -1,4 +1,4 @@
-"""Motion of one axis in closed form: movements with limited acceleration that end at rest, and braking.
+"""Motion of one axis in closed form: movements with limited acceleration that end at rest.
 
 Times are in s of the simulated controller, positions in mm, speeds in mm/s. As in Grbl's planner, a movement with the
 same direction and speed as the previous one continues it without a stop. Between all other movements the axis stops,
@@ -63,29 +63,6 @@ class Ramp:
         return self.start_mm + sign * gone, sign * speed
 
 
-@dataclass(frozen=True)
-class Brake:
-    """Braking from a signed ``speed`` at ``start_mm`` to rest."""
-
-    start_mm: float
-    speed: float
-    acceleration: float
-    start_s: float
-
-    @property
-    def end_s(self) -> float:
-        """Time of the end."""
-        return self.start_s + abs(self.speed) / self.acceleration
-
-    def state_at(self, time_s: float) -> tuple[float, float]:
-        """Return position and signed speed."""
-        # Calculated from the end, so that the final position is exact.
-        left = self.end_s - min(max(time_s, self.start_s), self.end_s)
-        slowing = math.copysign(self.acceleration, self.speed)
-        way = self.speed * abs(self.speed) / (2 * self.acceleration)
-        return self.start_mm + way - slowing * left**2 / 2, slowing * left
-
-
 @dataclass
 class Axis:
     """Queue of movements that can be held and resumed; times of successive calls must not decrease."""
@@ -93,7 +70,7 @@ class Axis:
     acceleration: float
     rest_mm: float = 0.0
     _moves: deque[Ramp] = field(default_factory=deque)
-    _brake: Brake | None = None
+    _brake: Ramp | None = None
     _stuck_s: float | None = None
 
     @property
@@ -162,7 +139,8 @@ class Axis:
         self.advance(time_s)
         if not self._brake:
             position, speed = self.state_at(time_s)
-            self._brake = Brake(position, speed, self.acceleration, self._clock(time_s))
+            end_mm, fast = position + speed * abs(speed) / (2 * self.acceleration), abs(speed)
+            self._brake = Ramp(position, (end_mm,), fast, self.acceleration, self._clock(time_s), fast)
 
     def resume(self, time_s: float) -> None:
         """Continue the remaining movements from rest."""

@@ -21,7 +21,7 @@ from twin.devices.grbl_controller import GrblController, StageState
 from twin.recording.render import AnyScene, choose_scene
 from twin.rendering_options import CPU, Options, Variant, use_variant
 from twin.scene.campaign import AnySensor, choose_sensors
-from twin.scene.description import Scene, replace_values
+from twin.scene.description import replace_values
 from twin.scene.platforms import Light, Motion, Shot
 from uwlts.errors import DescriptionError, DesignError
 from uwlts.model.sensor import Stage
@@ -39,25 +39,16 @@ _WATCH_S = 0.2
 _FORM = re.compile(r"(?P<name>[a-z-]+)(:(?P<argument>[^@]+))?(@(?P<frame>[1-9]\d*))?")
 
 
-@dataclass(frozen=True)
-class _Kind:
-    """Default argument of a fault (None if it takes no argument), and the rules for the argument."""
-
-    argument: float | None = None
-    whole: bool = True
-    signed: bool = False
-
-
-_KINDS = {
-    **dict.fromkeys(("drop", "repeat", "cut"), _Kind(1)),
-    "delay": _Kind(1.0, whole=False),
-    **dict.fromkeys(("camera-disconnect", "stage-disconnect", "mute", "cut-line", "stall"), _Kind()),
-    "stop-short": _Kind(40),
-    "lose-steps": _Kind(40, signed=True),
-    "alarm": _Kind(1),
-    **dict.fromkeys(("hold", "restart", "garbage", "break-laser"), _Kind()),
+_ARGUMENTS: dict[str, float | None] = {
+    **dict.fromkeys(("drop", "repeat", "cut"), 1),
+    "delay": 1.0,
+    **dict.fromkeys(("camera-disconnect", "stage-disconnect", "mute", "cut-line", "stall")),
+    **dict.fromkeys(("stop-short", "lose-steps"), 40),
+    "alarm": 1,
+    **dict.fromkeys(("hold", "restart", "garbage", "break-laser")),
 }
-NAMES = tuple(_KINDS)
+"""Default argument of each fault, of the type that it takes; None if it takes no argument."""
+NAMES = tuple(_ARGUMENTS)
 
 
 @dataclass(frozen=True)
@@ -91,26 +82,28 @@ class Fault:
 
 
 def parse_fault(text: str) -> Fault:
-    """Parse a fault NAME[:ARGUMENT][@FRAME]; defaults are the kind's argument and the first frame.
+    """Parse a fault NAME[:ARGUMENT][@FRAME]; defaults are those of `_ARGUMENTS`, and the first frame.
 
     Raises DescriptionError if the fault is unknown, or the argument is not valid.
     """
     found = _FORM.fullmatch(text)
-    if not found or found["name"] not in _KINDS:
+    if not found or found["name"] not in _ARGUMENTS:
         raise DescriptionError(f"'{text}' is not a fault: write NAME[:ARGUMENT][@FRAME] with one of {', '.join(NAMES)}")
-    kind, argument = _KINDS[found["name"]], found["argument"]
-    if argument is not None and kind.argument is None:
-        raise DescriptionError(f"the fault {found['name']} takes no argument; found '{argument}'")
-    value = kind.argument
+    name, argument = found["name"], found["argument"]
+    value = _ARGUMENTS[name]
     if argument is not None:
+        if value is None:
+            raise DescriptionError(f"the fault {name} takes no argument; found '{argument}'")
+        kind = type(value)
         try:
-            value = int(argument) if kind.whole else float(argument)
+            value = kind(argument)
         except ValueError as error:
-            wanted = "a whole number" if kind.whole else "a number of seconds"
-            raise DescriptionError(f"the argument of {found['name']} is '{argument}', not {wanted}") from error
-        if not math.isfinite(value) or (value <= 0 and not kind.signed):
-            raise DescriptionError(f"the argument of {found['name']} is '{argument}'; it must be positive")
-    return Fault(found["name"], value, int(found["frame"] or 1))
+            wanted = "a whole number" if kind is int else "a number of seconds"
+            raise DescriptionError(f"the argument of {name} is '{argument}', not {wanted}") from error
+        # Steps can be lost in both directions.
+        if not math.isfinite(value) or (value <= 0 and name != "lose-steps"):
+            raise DescriptionError(f"the argument of {name} is '{argument}'; it must be positive")
+    return Fault(name, value, int(found["frame"] or 1))
 
 
 # Streams of random numbers: walks depend on the position, noise on the frame.
@@ -206,8 +199,10 @@ class Bench:
 
         A given state includes motion blur. The noise is different in each call.
         """
-        began, known = time.perf_counter(), len(self._seen)
-        travel = None if state is None else self._studio.travel_at(state.speed_mm_per_s, exposure_ms=exposure_ms)
+        began, known, travel = time.perf_counter(), len(self._seen), None
+        if state is not None and state.moving and self._studio.options.effects.motion:
+            velocity = state.speed_mm_per_s * self._track.motion.unit_direction()
+            travel = self._studio.travel_at(velocity, np.zeros(3), exposure_ms=exposure_ms)
         state = state or self._state()
         if travel is not None:
             self._seen.clear()
@@ -288,15 +283,6 @@ class ServedTwin:
                 signal.signal(number, handler)
 
 
-def _stage_motion(described: Scene) -> Motion:
-    motion = described.motion
-    if not isinstance(motion, Motion):
-        raise DescriptionError(
-            f"{described.title} moves on a {motion.kind}; expected a scene with a motion of the stage"
-        )
-    return motion
-
-
 @contextmanager
 def serve(
     scene: AnyScene,
@@ -373,7 +359,11 @@ def serve(
         raise DescriptionError("lamp-and-laser cannot be served, because the controller switches the laser: remove it")
     if not speed_up > 0:
         raise DescriptionError(f"speed_up is {speed_up:g}; it must be positive")
-    motion = _stage_motion(described)
+    motion = described.motion
+    if not isinstance(motion, Motion):
+        raise DescriptionError(
+            f"{described.title} moves on a {motion.kind}; expected a scene with a motion of the stage"
+        )
     _, built = choose_sensors(sensor, as_built)
     faults = [parse_fault(text) for text in fault]
     use_variant(variant)

@@ -17,7 +17,7 @@ from scipy import optimize, special, stats
 from twin.scene.campaign import Take
 from twin.scene.description import Scene
 from twin.scene.forms import PittedPipe, Weld
-from twin.scene.forms.flawed_parts import pit_depths, pit_places, undercut_depths
+from twin.scene.forms.parts import pit_depths, pit_places, undercut_depths
 from twin.scene.platforms import Motion
 from uwlts.errors import CaptureError
 

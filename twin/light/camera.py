@@ -188,7 +188,7 @@ class CameraView:
         if spacing not in self._grids:
             columns, rows = -(-self.camera.width_px // spacing) + 1, -(-self.camera.height_px // spacing) + 1
             x, y = np.meshgrid(np.arange(columns) * spacing - 0.5, np.arange(rows) * spacing - 0.5)
-            bundle = self.trace_bundle(to_jit(mi.Float, x), to_jit(mi.Float, y))
+            bundle = self.trace_bundle(to_jit(x), to_jit(y))
             dr.eval(bundle.origin, bundle.direction, bundle.weight)
             self._grids[spacing] = bundle, (rows, columns)
         return self._grids[spacing]
@@ -222,7 +222,7 @@ class CameraView:
         shift = np.concatenate([[(0, 0), (1, 0), (0, 1)], np.zeros((_RIM_POINTS, 2))])
         at = (image[:, None] + shift).reshape(-1, 2)
         through = np.tile(np.concatenate([np.zeros((3, 2)), rim]), (len(image), 1))
-        x, y, pupil_x, pupil_y = (to_jit(mi.Float, values) for values in (*at.T, *through.T))
+        x, y, pupil_x, pupil_y = (to_jit(values) for values in (*at.T, *through.T))
         bundle = self.trace_bundle(x, y, mi.Point2f(pupil_x, pupil_y))
         dr.eval(bundle.origin, bundle.direction, bundle.weight)
         transform = self._camera_from_object

@@ -26,6 +26,7 @@ from twin.light.sheet import Sheet, SheetLight
 from twin.light.water import AngleTable, Scattering, one_minus_cosine
 from twin.scene.objects import MirrorFace
 from twin.scene.platform_kinds import GRAVITY_M_S2
+from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Sensor
 
 _LARGEST_SLOPE = 0.7
@@ -36,7 +37,7 @@ class Light:
     """A laser sheet in a scene at a given sensor pose, either direct or reflected by one mirror face."""
 
     def __init__(self, sheet: Sheet, pose: SensorPose, mirror: MirrorFace | None = None):
-        self.sheet, self._pose, self._mirror = sheet, pose, mirror
+        self.sheet, self._pose, self.mirror = sheet, pose, mirror
         self.power_w, own = opaque(sheet.power_w), sheet.own_from_object
         if mirror is not None:
             object_from_face = np.linalg.inv(pose.scene_from_object) @ mirror.pose
@@ -51,7 +52,7 @@ class Light:
 
     def to_sheet_frame(self, origin: Point3f, direction: Vector3f) -> tuple[Point3f, Vector3f]:
         """Transform a ray from the sensor's OCS into the frame of the sheet, where the nominal sheet is X = 0."""
-        if self._mirror is not None:
+        if self.mirror is not None:
             origin, direction = self._reflection @ mi.Point3f(origin), self._reflection @ mi.Vector3f(direction)
         if self._to_own is None:
             return origin, direction
@@ -59,7 +60,7 @@ class Light:
 
     def evaluate(self, p: Point3f, after_s: Float | None = None) -> SheetLight:
         """Return the sheet's light at points in the sensor's OCS, without shadows; 0 where the mirror reflects none."""
-        if self._mirror is None:
+        if self.mirror is None:
             return self._evaluate_direct(p)
         # Mirrors do not move with the sensor.
         resting = self._pose.to_rest_frame(p, after_s)
@@ -85,11 +86,11 @@ class Light:
     @property
     def mirrored(self) -> bool:
         """True if the light is reflected by a mirror."""
-        return self._mirror is not None
+        return self.mirror is not None
 
     def may_reach(self, p: Point3f, light: SheetLight) -> Bool | None:
         """Return the mask of points that the mirror can illuminate; None for a direct light, which has no limit."""
-        return None if self._mirror is None else self._intersect_mirror(p, -light.direction)[1]
+        return None if self.mirror is None else self._intersect_mirror(p, -light.direction)[1]
 
     def reaches(self, objects: mi.Scene, p: Point3f, light: SheetLight, after_s: Float | None, active: Bool):
         """Return the mask of points in the OCS, with their ``light``, that have a free path to the laser's window.
@@ -97,7 +98,7 @@ class Light:
         ``after_s`` are times of the points after that of the pose, s; None: at rest. Only ``active`` points are tested.
         """
         towards = -light.direction
-        if self._mirror is None:
+        if self.mirror is None:
             return active & ~self._is_blocked(objects, p, towards, light.exit_mm, after_s, active)
         resting = self._pose.rotate_to_rest_frame(towards, after_s)
         t, meets = self._intersect_mirror(self._pose.to_rest_frame(p, after_s), resting)
@@ -135,7 +136,7 @@ class Light:
         light = self.sheet.evaluate(mi.Point3f(origin + direction * t))
         t -= light.distance_mm / dr.dot(direction, light.normal)
         light = self.sheet.evaluate(mi.Point3f(origin + direction * t))
-        if self._mirror is not None:
+        if self.mirror is not None:
             share = self._share
             light = replace(light, irradiance=light.irradiance * share, in_middle=light.in_middle * share)
         return t, light
@@ -287,14 +288,12 @@ _PUPIL_SAMPLES = 128
 """Number of rays per computed pixel: a blurred edge has steps of a hundredth of the ring's brightness."""
 
 
-def reflect_ring(
-    view: CameraView, sensor: Sensor, *, irradiance_w_per_m2: float, distance_mm: float, reflectance: float
-) -> np.ndarray:
+def reflect_ring(view: CameraView, sensor: Sensor, *, reflectance: float) -> np.ndarray:
     """Return the irradiance (H, W) in W/mm2 on the image sensor by a lamp ring that the window reflects.
 
     A diffuse ring of radius R and area A has the radiance L. It illuminates a surface on the axis at the distance d
-    from the pupil with E = L A d^2 / (d^2 + R^2)^2; refraction is neglected. The camera sees the ring mirrored by the
-    inner face of its mounted window.
+    from the pupil with E = L A d^2 / (d^2 + R^2)^2; refraction is neglected. E is that of the sensor's lamp, d the
+    depth of the stand-off. The camera sees the ring mirrored by the inner face of its mounted window.
     """
     camera, (inner, outer) = sensor.camera, RING_MM
     columns, rows = -(-camera.width_px // _CELL_PX), -(-camera.height_px // _CELL_PX)
@@ -302,9 +301,7 @@ def reflect_ring(
     count = x.size * _PUPIL_SAMPLES
     index = dr.arange(mi.UInt32, count)
     pixel, sample = index // _PUPIL_SAMPLES, index % _PUPIL_SAMPLES
-    chief = view.lens.directions(
-        dr.gather(mi.Float, to_jit(mi.Float, x), pixel), dr.gather(mi.Float, to_jit(mi.Float, y), pixel)
-    )
+    chief = view.lens.directions(dr.gather(mi.Float, to_jit(x), pixel), dr.gather(mi.Float, to_jit(y), pixel))
     # Evenly spread points of a disc: a spiral by the golden angle.
     turn = math.pi * (3 - math.sqrt(5)) * mi.Float(sample)
     radius = dr.sqrt((mi.Float(sample) + 0.5) / _PUPIL_SAMPLES)
@@ -320,7 +317,9 @@ def reflect_ring(
     seen = dr.select((away > inner) & (away < outer) & (back.z < 0), cosine * view.lens.irradiance_on_axis, 0.0)
     shares = dr.block_sum(seen, _PUPIL_SAMPLES).numpy().reshape(rows, columns) / _PUPIL_SAMPLES
     middle, area = 0.5 * (inner + outer), math.pi * (outer**2 - inner**2)
-    radiance = 1e-6 * irradiance_w_per_m2 * (distance_mm**2 + middle**2) ** 2 / (area * distance_mm**2)
+    distance_mm = float(camera_from_object(sensor)[2, 3])
+    irradiance = 1e-6 * sensor.lamp.irradiance_w_per_m2
+    radiance = irradiance * (distance_mm**2 + middle**2) ** 2 / (area * distance_mm**2)
     size = columns * _CELL_PX, rows * _CELL_PX
     whole = cv2.resize(shares.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
     return np.float32(radiance * reflectance) * whole[: camera.height_px, : camera.width_px]

@@ -56,15 +56,9 @@ def pupil_shifts(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     steps up. The 16 pixels of a 4 x 4 block use 8 evenly spread shifts (the R2 sequence, Roberts 2018) and their
     negatives. The shifts are thus symmetric about the pupil's centre and do not shift the image of the block.
     """
-    return _block_shifts()[:, rows & 3, columns & 3]
-
-
-@cache
-def _block_shifts() -> np.ndarray:
-    """Return the shifts (2, 4, 4) of the pixels of a block."""
     order = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]])
     shift = (order % 8 + 0.5) * np.array([0.7548776662466927, 0.5698402909980532])[:, None, None] % 1
-    return np.where(order < 8, shift, 1 - shift)
+    return np.where(order < 8, shift, 1 - shift)[:, rows & 3, columns & 3]
 
 
 def _kernel(x: np.ndarray) -> np.ndarray:

@@ -35,6 +35,7 @@ _SLOPE = 3.0
 Bader, J. Geophys. Res. 75, 2822, 1970; Sheldon et al., Limnol. Oceanogr. 17, 327, 1972.
 """
 _REFLECTANCE = 0.3  # diffuse reflectance of particles (assumed): aggregates are grey to brownish white
+_WATER_INDEX = 1.33  # of water at visible wavelengths, relative to the air in bubbles
 _SIGMAS = 3.0  # bodies farther from the sheet's centre than this many standard deviations are treated as dark
 _MOST_BODIES = 50_000  # largest number of bodies in one image; more of them would look like haze
 _STEP_PX = 0.5  # largest distance of the discs that form a track; a disc is at least a pixel wide
@@ -95,7 +96,7 @@ def sample_spots(
 
     def seen(x: np.ndarray, y: np.ndarray, aside: np.ndarray) -> dict[str, np.ndarray]:
         """Return volume (mm3) per pixel, light of the sheet, and area per pixel at image positions ``x`` and ``y``."""
-        at = [(to_jit(mi.Float, x + dx), to_jit(mi.Float, y + dy)) for dx, dy in ((0, 0), (1, 0), (0, 1))]
+        at = [(to_jit(x + dx), to_jit(y + dy)) for dx, dy in ((0, 0), (1, 0), (0, 1))]
         bundles = [view.trace_bundle(*each) for each in at]
         crossed = [light.intersect(*light.to_sheet_frame(each.origin, each.direction)) for each in bundles]
         t, bundle = crossed[0][0], bundles[0]
@@ -109,12 +110,12 @@ def sample_spots(
             through = dr.dot(moved, middle.normal)
             # Bodies that are in the sheet at any time of the exposure.
             reach = reach + dr.abs(through) / (2 * _SIGMAS)
-            start = middle.normal * (reach * to_jit(mi.Float, aside))
+            start = middle.normal * (reach * to_jit(aside))
             tracks = {"start": _image_shift(start, right, down, bundle.direction)}
             tracks["moved"] = _image_shift(moved, right, down, bundle.direction)
             tracks = {f"{name}_{axis}": values[k] for name, values in tracks.items() for k, axis in enumerate("xy")}
             tracks |= {"through": through, "reach": reach, "sigma": middle.sigma_mm}
-        place = mi.Point3f(points[0] + middle.normal * (reach * to_jit(mi.Float, aside)))
+        place = mi.Point3f(points[0] + middle.normal * (reach * to_jit(aside)))
         lit = light.evaluate(place)
         brightness = lit.irradiance if travel is None else lit.in_middle
         hit = objects.scene.ray_intersect_preliminary(pose.ray(bundle.origin, bundle.direction))
@@ -208,14 +209,14 @@ def diffuse_sphere(cosine: np.ndarray) -> np.ndarray:
     return 2 / 3 * _REFLECTANCE * (np.sin(angle) + (np.pi - angle) * np.cos(angle)) / np.pi
 
 
-def bubble(cosine: np.ndarray, *, index: float = 1.33) -> np.ndarray:
+def bubble(cosine: np.ndarray) -> np.ndarray:
     """Return the radiant intensity in 1/sr reflected by an air bubble per irradiance and squared radius.
 
     A reflecting sphere sends R / 4 into every direction (Davis, J. Opt. Soc. Am. 45, 572, 1955). R is the Fresnel
     reflectance at the incidence angle (180 deg - scattering angle) / 2: reflection is total up to a scattering angle of
     about 83 deg. ``cosine`` is that of the scattering angle. Light transmitted through the bubble is neglected.
     """
-    incidence = (np.pi - np.arccos(np.clip(cosine, -1, 1))) / 2
+    index, incidence = _WATER_INDEX, (np.pi - np.arccos(np.clip(cosine, -1, 1))) / 2
     inside = index * np.sin(incidence)
     cos_in, cos_out = np.cos(incidence), np.sqrt(np.maximum(1 - np.square(inside), 0))
     square = (index * cos_in - cos_out) / (index * cos_in + cos_out)

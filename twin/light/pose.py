@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import drjit as dr
 import mitsuba as mi
@@ -38,7 +38,7 @@ class Travel:
 
     velocity_mm_s: np.ndarray
     exposure_s: float
-    turn_rad_s: np.ndarray | None = None
+    turn_rad_s: np.ndarray = field(default_factory=lambda: np.zeros(3))
     row_s: float = 0.0
     middle_row: float = 0.0
 
@@ -55,8 +55,7 @@ class Travel:
 
     def fastest_mm_s(self, reach_mm: float) -> float:
         """Return the largest speed in mm/s of points within ``reach_mm`` of the OCS's origin."""
-        turn = 0.0 if self.turn_rad_s is None else float(np.linalg.norm(self.turn_rad_s))
-        return float(np.linalg.norm(self.velocity_mm_s)) + turn * reach_mm
+        return float(np.linalg.norm(self.velocity_mm_s) + np.linalg.norm(self.turn_rad_s) * reach_mm)
 
 
 class SensorPose:
@@ -71,7 +70,7 @@ class SensorPose:
             # The motion is expressed in the OCS of the sensor at rest.
             into = self.scene_from_object[:3, :3].T
             self._velocity = mi.Vector3f(opaque_point(into @ travel.velocity_mm_s))
-            turn = np.zeros(3) if travel.turn_rad_s is None else into @ travel.turn_rad_s
+            turn = into @ travel.turn_rad_s
             if rate := float(np.linalg.norm(turn)):
                 self._axis, self._rate = mi.Vector3f(opaque_point(turn / rate)), opaque(rate)
 
@@ -81,17 +80,14 @@ class SensorPose:
             return False
         if self.travel is None or other.travel is None:
             return self.travel is other.travel
-        pairs = zip(vars(self.travel).values(), vars(other.travel).values(), strict=True)
-        return all(np.array_equal(mine, theirs) for mine, theirs in pairs)
+        return all(map(np.array_equal, vars(self.travel).values(), vars(other.travel).values()))
 
     def displace(self, after_s: float) -> SensorPose:
         """Return the pose after a time, without motion."""
         assert self.travel is not None
         transform = self.scene_from_object.copy()
         transform[:3, 3] += after_s * self.travel.velocity_mm_s
-        if self.travel.turn_rad_s is not None:
-            turned = Rotation.from_rotvec(after_s * self.travel.turn_rad_s).as_matrix()
-            transform[:3, :3] = turned @ transform[:3, :3]
+        transform[:3, :3] = Rotation.from_rotvec(after_s * self.travel.turn_rad_s).as_matrix() @ transform[:3, :3]
         return SensorPose(transform)
 
     def to_rest_frame(self, point: Point3f, after_s: Float | None) -> Point3f:
@@ -120,10 +116,11 @@ class SensorPose:
         It applies in the middle of the exposure, in the OCS.
         """
         into = self.scene_from_object[:3, :3].T
-        way = mi.Vector3f(opaque_point(into @ travel.velocity_mm_s * travel.exposure_s))
-        if travel.turn_rad_s is not None:
-            way += dr.cross(mi.Vector3f(opaque_point(into @ travel.turn_rad_s * travel.exposure_s)), mi.Vector3f(point))
-        return -way
+        way, turn = (
+            mi.Vector3f(opaque_point(into @ rate * travel.exposure_s))
+            for rate in (travel.velocity_mm_s, travel.turn_rad_s)
+        )
+        return -(way + dr.cross(turn, mi.Vector3f(point)))
 
     def _rotate(self, vector: Vector3f, after_s: Float | None, *, sign: float) -> Vector3f:
         """Rotate vectors by the sensor's rotation within a time (Rodrigues' formula)."""

@@ -12,10 +12,10 @@ fixed in the scene, so nothing is rebuilt or recompiled between frames.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import NamedTuple
+from typing import Literal
 
 import cv2
 import drjit as dr
@@ -44,16 +44,15 @@ from twin.light.image_sampling import (
     mark_near_sheet,
     pupil_shifts,
 )
-from twin.light.multiple_scattering import IndirectLight, LightSources, decay_with_distance
+from twin.light.multiple_scattering import IndirectLight, decay_with_distance
 from twin.light.particles import Body, sample_spots
 from twin.light.pose import Rays, SensorPose, Travel
 from twin.light.sheet import Sheet, SheetLight, lit_sigma_mm, spread_irradiance
 from twin.light.walk import Walker
 from twin.light.water import Scattering
-from twin.rendering_options import ALL, Effects
+from twin.rendering_options import ALL, Effects, Flaws
 from twin.scene.description import Scene
 from twin.scene.objects import build_objects
-from twin.scene.platforms import Light as LightName
 from uwlts.model.placement import camera_from_object, check_design
 from uwlts.model.sensor import Medium, Sensor
 
@@ -75,44 +74,6 @@ _STRIPE_SUMS, _LINE_SUMS = 3, 3
 _REACH_SHARE = 1.5  # largest distance of visible surfaces from the OCS's origin, divided by the stand-off (approximate)
 
 
-class _Nodes(NamedTuple):
-    """Haze (H, W) in W/mm2 and images of lit surfaces (`LightSources`) that the nodes of a pose show."""
-
-    haze: np.ndarray
-    surfaces: list[np.ndarray]
-
-
-@dataclass(frozen=True, eq=False)
-class SurfaceLines:
-    """Surface point in scene coordinates of each profile line, NaN for none, and the unit normal there, (L, 3)."""
-
-    points_mm: np.ndarray
-    normals: np.ndarray
-
-    def equals(self, other: SurfaceLines) -> bool:
-        """Return whether points and normals equal those of ``other``."""
-        pairs = (self.points_mm, other.points_mm), (self.normals, other.normals)
-        return all(np.array_equal(mine, theirs, equal_nan=True) for mine, theirs in pairs)
-
-    def planes(self, line: np.ndarray) -> np.ndarray:
-        """Return normals and offsets (N, 4) of the planes through the points of lines (N,)."""
-        offset = np.sum(self.normals * self.points_mm, axis=1, keepdims=True)
-        return np.concatenate([self.normals, offset], axis=1).astype(np.float32)[line]
-
-
-class LineLight(NamedTuple):
-    """Direct light of the first laser in the pixels of profile lines with a point.
-
-    ``rows`` and ``columns`` (P,) are the pixels. ``means`` (3, P) are means over each pixel: irradiance in W/mm2 from
-    all surfaces, and from others than the line's; and the density of the sheet's normalised profile on the line's
-    surface, in 1/mm of distance from the sheet.
-    """
-
-    rows: np.ndarray
-    columns: np.ndarray
-    means: np.ndarray
-
-
 @dataclass(eq=False)
 class _LocatedStripes:
     """Stripes of a pose in cells of the nodes' grid, and what else is known of that pose."""
@@ -120,9 +81,13 @@ class _LocatedStripes:
     pose: SensorPose
     own: np.ndarray  # mask of the cells that the first laser's stripe meets
     lit: np.ndarray  # mask of the cells that light of any stripe reaches
-    nodes: _Nodes | None  # None once the laser's frame is rendered: the next one may show changed surfaces
-    line_light: tuple[SurfaceLines, int, LineLight] | None = None
-    """Light of lines with a number of samples, if the laser's frame measured it."""
+    nodes: tuple[np.ndarray, list[np.ndarray]] | None
+    """Haze (H, W) in W/mm2 and images of lit surfaces (`IndirectLight.image`).
+
+    None once the laser's frame is rendered: the next one may show changed surfaces.
+    """
+    line_light: tuple[np.ndarray, int, tuple[np.ndarray, ...]] | None = None
+    """Lines, number of samples, and result of `Renderer.render_line_light`, if the laser's frame measured it."""
 
 
 @dataclass(frozen=True)
@@ -165,10 +130,8 @@ class LaserFrame:
 class Renderer:
     """Renderer of one sensor in one medium and one scene.
 
-    ``uneven_lamp`` is the relative loss of lamp light away from its spot. ``caustics`` is the water surface that
-    focuses daylight. ``drifting`` is the number of bodies of each kind per litre (`twin.rendering_options.Flaws`).
-    ``surface_seed`` is the seed of random reflectances. DesignError if the sensor cannot work in the medium;
-    DescriptionError if an object cannot be built.
+    Of the ``flaws``, those of lamp and water are rendered. ``seed`` is that of random reflectances and waves.
+    DesignError if the sensor cannot work in the medium; DescriptionError if an object cannot be built.
     """
 
     def __init__(
@@ -178,24 +141,30 @@ class Renderer:
         scene: Scene,
         *,
         effects: Effects = ALL,
-        uneven_lamp: float = 0.0,
-        caustics: Caustics | None = None,
-        drifting: Mapping[Body, float] | None = None,
-        surface_seed: int = 0,
+        flaws: Flaws = Flaws(),
+        seed: int = 0,
     ):
-        self.design, self._uneven_lamp = check_design(sensor, medium), uneven_lamp
-        self.sensor, self.medium, self.effects = sensor, medium, effects
-        self._caustics, self._drifting = caustics, drifting or {}
-        wavelength = sensor.laser.wavelength_nm
+        self.design = check_design(sensor, medium)
+        self.sensor, self.medium, self.effects, self._flaws = sensor, medium, effects, flaws
+        self._size, wavelength = (sensor.camera.height_px, sensor.camera.width_px), sensor.laser.wavelength_nm
         self.objects = build_objects(
             scene,
             medium_index=medium.refractive_index(wavelength),
             wavelength_nm=wavelength,
             gloss=effects.gloss,
-            seed=surface_seed,
+            seed=seed,
         )
         self.view = CameraView(sensor, medium)
         self.scattering = Scattering(medium, wavelength)
+        self._caustics = None
+        if flaws.caustics and medium.kind != "air":
+            self._caustics = Caustics(
+                wind_m_s=flaws.caustics,
+                depth_mm=1e3 * scene.depth_m,
+                index=medium.refractive_index(wavelength),
+                scattering_per_mm=self.scattering.coefficient,
+                seed=seed,
+            )
         self.sheet = Sheet(sensor, medium)
         self._sheets = [self.sheet, *(Sheet(sensor, medium, laser) for laser in sensor.more_lasers)]
         self._crossings: dict[Sheet, SheetCrossing] = {}
@@ -209,43 +178,47 @@ class Renderer:
 
     def irradiance(
         self,
-        light: LightName,
+        light: Literal["lamp", "day"],
         scene_from_object: np.ndarray,
         *,
         spp: int,
-        seed: int = 0,
         travel: Travel | None = None,
         time_s: float = 0.0,
         exposure_s: float = 0.0,
     ) -> np.ndarray:
-        """Return the irradiance (H, W) on the image sensor in W/mm2, float32.
+        """Return the irradiance (H, W) of lamp or daylight on the image sensor in W/mm2, float32.
 
-        Parameters
-        ----------
-        light
-            "laser" includes daylight; "day" is daylight with laser and lamp off.
-        scene_from_object : (4, 4)
-            Pose of the OCS in the scene.
-        spp
-            Number of samples per lit pixel, at the same positions in every pixel.
-        seed
-            Seed of the random walks. Equal arguments give equal images.
-        travel
-            Motion of the sensor during the exposure; None: at rest.
-        time_s, exposure_s
-            Time and duration of the exposure, for the waves of the water surface.
+        ``scene_from_object`` (4, 4) is the pose of the OCS in the scene, and ``travel`` the motion of the sensor during
+        the exposure; None: at rest. Each lit pixel has ``spp`` samples, at the same positions in every pixel. Waves of
+        the water surface depend on time and duration of the exposure.
         """
-        if light == "laser":
-            day = self.irradiance(
-                "day", scene_from_object, spp=spp, travel=travel, time_s=time_s, exposure_s=exposure_s
-            )
-            return day + self.laser_frame(scene_from_object, spp=spp, seed=seed, travel=travel).irradiance()
         if light == "day" and not (self.effects.ambient and self.sensor.lamp.ambient_w_per_m2 > 0):
-            return np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
-        pose, pattern = SensorPose(scene_from_object, travel), None
-        if self._caustics is not None and light == "day":
-            pattern = to_jit(mi.Float, self._caustics.pattern(time_s, exposure_s))
-        return self._render_lamp_frame(pose, spp=spp, ambient=light == "day", pattern=pattern)
+            return np.zeros(self._size, np.float32)
+        pose, ambient, pattern = SensorPose(scene_from_object, travel), light == "day", None
+        if self._caustics is not None and ambient:
+            pattern = to_jit(self._caustics.pattern(time_s, exposure_s))
+        begin_kernels()
+        bundle, shape = self.view.trace_grid(1)
+        segment = next(self._segments(pose, bundle, None))
+        value = self._compute_even_light(segment, ambient, pattern)
+        depth = dr.select(segment.valid, self.view.depth_mm(segment.end()), dr.nan)
+        dr.eval(value, depth)
+        nodes = value.numpy().reshape(shape)
+        # Only pixels with changes are sampled finely.
+        low, high = combine_corners(np.minimum, nodes), combine_corners(np.maximum, nodes)
+        changes = high - low > CHANGE_SHARE * nodes.max()
+        if self.effects.defocus:
+            changes = dilate_cells(changes, self._blur_px(changes, depth.numpy().reshape(shape)), cell_px=1)
+        if travel is not None:
+            changes[:] = True  # motion may change any pixel
+        image = 0.25 * combine_corners(np.add, nodes)
+
+        def evenly_lit(pose: SensorPose, bundle: Rays, after_s: Float | None, pixel: UInt32) -> tuple[Float]:
+            return (self._compute_even_light(next(self._segments(pose, bundle, after_s)), ambient, pattern),)
+
+        for rows, columns in _split_pixels(*find_marked(changes), spp=spp):
+            image[rows, columns] = self._render_pixels(evenly_lit, pose, rows, columns, spp=spp, shifted=True)()[0]
+        return image
 
     def laser_frame(
         self,
@@ -255,12 +228,13 @@ class Renderer:
         seed: int = 0,
         travel: Travel | None = None,
         through_water: Travel | None = None,
-        lines: SurfaceLines | None = None,
+        lines: np.ndarray | None = None,
     ) -> LaserFrame:
-        """Return the light of the laser on the image sensor; see `irradiance`.
+        """Return the light of the laser on the image sensor; see `irradiance`. Equal arguments give equal light.
 
-        ``through_water`` is the motion of the sensor relative to the water and its particles; None: at rest. ``lines``
-        are the points and normals of `line_light`, which is then measured in the same pass and needs no time later.
+        ``seed`` is that of the random walks and particles. ``through_water`` is the motion of the sensor relative to
+        the water and its particles; None: at rest. ``lines`` are those of `render_line_light`, which is then measured
+        in the same pass and needs no time later.
         """
         pose = SensorPose(scene_from_object, travel)
         located = self._locate_stripes(pose, with_nodes=True)
@@ -268,7 +242,7 @@ class Renderer:
         lit, (haze, surfaces), located.nodes = located.lit, located.nodes, None
         begin_kernels()
         direct, mirrored = make_lights(self._sheets, pose, self._mirrors)
-        rows, columns = find_marked(self._expand_cells(lit))
+        rows, columns = find_marked(expand_cells(lit, *self._size))
         stripe_means = self._render_stripe(pose, rows, columns, direct + mirrored, spp=spp, lines=lines)
         walker, walked = Walker(self.objects, self.scattering, self.effects, pose, direct, self._reach_mm), None
         if walker.finds_light:
@@ -281,7 +255,7 @@ class Renderer:
         if walked is not None:
             image = np.zeros_like(haze)
             image[rows, columns] = stripe
-            longer = partial(walked.image, LightSources(image, haze, surfaces))
+            longer = partial(walked.image, image, haze, surfaces)
         haze = haze if self.effects.haze else np.zeros_like(haze)
         bright = np.maximum(stripe, np.finfo(np.float32).tiny)
         particles = self._render_particles(direct, pose, through_water, seed=seed)
@@ -292,10 +266,11 @@ class Renderer:
         self, direct: list[Light], pose: SensorPose, through_water: Travel | None, *, seed: int
     ) -> np.ndarray:
         """Return the irradiance (H, W) in W/mm2 of particles and bubbles in the sheets."""
-        camera = self.sensor.camera
-        image = np.zeros((camera.height_px, camera.width_px), np.float32)
+        image = np.zeros(self._size, np.float32)
         rng = np.random.default_rng([seed, _DRIFTING_STREAM])
-        for body, per_litre in self._drifting.items():
+        bodies: tuple[tuple[Body, float], ...]
+        bodies = ("particles", self._flaws.particles), ("bubbles", self._flaws.bubbles)
+        for body, per_litre in bodies:
             for light in direct if per_litre > 0 else ():
                 seen = sample_spots(
                     self.view,
@@ -311,12 +286,12 @@ class Renderer:
                     sparkle=self.effects.speckle,
                     rng=rng,
                 )
-                image += seen.draw(camera.height_px, camera.width_px)
+                image += seen.draw(*self._size)
         return image
 
     def lit_pixels(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray]:
         """Return rows and columns of the pixels whose chief rays meet the stripe of the first laser."""
-        return find_marked(self._expand_cells(self._locate_stripes(pose).own))
+        return find_marked(expand_cells(self._locate_stripes(pose).own, *self._size))
 
     def _locate_stripes(self, pose: SensorPose, *, with_nodes: bool = False) -> _LocatedStripes:
         """Locate the stripes; they are known for the last pose, unless its nodes are wanted again."""
@@ -333,29 +308,34 @@ class Renderer:
         segment = next(self._segments(pose, bundle, after_s))
         return segment.weight * self._radiance(pose, segment, direct, after_s), segment
 
-    def render_line_light(self, pose: SensorPose, lines: SurfaceLines, *, spp: int) -> LineLight:
+    def render_line_light(self, pose: SensorPose, lines: np.ndarray, *, spp: int) -> tuple[np.ndarray, ...]:
         """Return the first laser's light on directly visible surfaces, and how much of it is on the lines' surfaces.
 
-        Side lobes of the sheet are excluded. A line's surface is what lies within one standard deviation of the sheet
-        of the plane through its point. It is known if the last frame was rendered with the same arguments.
+        It is given by rows and columns (P,) of the pixels of lines with a point, and means (3, P) over each pixel:
+        irradiance in W/mm2 from all surfaces, and from others than the line's; and the density of the sheet's
+        normalised profile on the line's surface, in 1/mm of distance from the sheet.
+
+        ``lines`` (2, L, 3) are a surface point in scene coordinates of each profile line, NaN for none, and the unit
+        normal there. Side lobes of the sheet are excluded. A line's surface is what lies within one standard deviation
+        of the sheet of the plane through its point. It is known if the last frame was rendered with the same arguments.
         """
         located = self._locate_stripes(pose)
         if located.line_light is not None:
             known_lines, known_spp, light = located.line_light
-            if known_spp == spp and known_lines.equals(lines):
+            if known_spp == spp and np.array_equal(known_lines, lines, equal_nan=True):
                 return light
-        rows, columns = find_marked(self._expand_cells(located.lit))
+        rows, columns = find_marked(expand_cells(located.lit, *self._size))
         direct, mirrored = make_lights(self._sheets, pose, self._mirrors)
         means = self._render_stripe(pose, rows, columns, direct + mirrored, spp=spp, lines=lines)()
         return self._select_lines(lines, rows, columns, means[_STRIPE_SUMS:])
 
-    def _select_lines(self, lines: SurfaceLines, rows: np.ndarray, columns: np.ndarray, means: np.ndarray) -> LineLight:
-        """Return the light (3, P) of pixels on lines with a point."""
-        known = np.isfinite(lines.points_mm[self._line_numbers(rows, columns), 0])
-        return LineLight(rows[known], columns[known], means[:, known])
+    def _select_lines(
+        self, lines: np.ndarray, rows: np.ndarray, columns: np.ndarray, means: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
+        known = np.isfinite(lines[0, self._line_numbers(rows, columns), 0])
+        return rows[known], columns[known], means[:, known]
 
     def _line_numbers(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Return the profile lines (P,) of pixels."""
         return columns if self.sensor.camera.stripe_along == "width" else rows
 
     # --- the lit surface ----------------------------------------------------------------------------------------------
@@ -375,7 +355,9 @@ class Renderer:
         for light in sources:
             here = light.evaluate(end, after_s)
             across = light.sheet.parts if lobes else light.sheet.parts[:1]
-            arriving = here.irradiance if lobes else across[0][0] * here.main_irradiance()
+            arriving = here.irradiance
+            if not lobes:
+                arriving = across[0][0] * (here.in_middle * dr.exp(-0.5 * dr.square(here.distance_mm / here.sigma_mm)))
             # The light of a coat or metal leaves where it arrives, that of a body is spread.
             parts = [(mi.BSDFContext(), arriving)]
             if self.objects.translucent:
@@ -395,12 +377,12 @@ class Renderer:
 
     def _laser_nodes(
         self, pose: SensorPose, direct: list[Light], mirrored: list[Light]
-    ) -> tuple[np.ndarray, np.ndarray, _Nodes]:
+    ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, list[np.ndarray]]]:
         """Return the cells (rows, columns) of the first laser's stripe and of all stripes, haze and lit surfaces."""
         bundle, shape = self.view.trace_grid(NODE_SPACING_PX)
         lit = np.zeros((shape[0] - 1, shape[1] - 1), bool)
         own, reach = lit.copy(), np.zeros_like(lit, np.float32)
-        image = np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
+        image = np.zeros(self._size, np.float32)
         surfaces: list[Float] = []
         for moment, sources in self._moments(pose, direct + mirrored):
             scattered = mi.Float(0.0)
@@ -433,8 +415,8 @@ class Renderer:
                     reach = np.fmax(reach, self._blur_px(near, depth.numpy().reshape(shape)))
                 lit |= near
             if moment is pose and dr.width(scattered) > 1:
-                image = self._expand_cells(0.25 * combine_corners(np.add, scattered.numpy().reshape(shape)))
-        return own, dilate_cells(lit, reach), _Nodes(image, [each.numpy().reshape(shape) for each in surfaces])
+                image = expand_cells(0.25 * combine_corners(np.add, scattered.numpy().reshape(shape)), *self._size)
+        return own, dilate_cells(lit, reach), (image, [each.numpy().reshape(shape) for each in surfaces])
 
     def _moments(self, pose: SensorPose, sources: list[Light]) -> Iterator[tuple[SensorPose, list[Light]]]:
         """Yield the pose and its lights, and further poses during the exposure if the sensor moves."""
@@ -449,7 +431,7 @@ class Renderer:
 
     def _crossing(self, light: Light, bundle: Rays) -> SheetCrossing:
         """Return the intersections of the nodes' rays with a sheet, cached for direct lights."""
-        if light.mirrored:
+        if light.mirror is not None:
             return intersect_sheet(light, self.scattering, bundle)
         if light.sheet not in self._crossings:
             found = intersect_sheet(light, self.scattering, bundle)
@@ -458,7 +440,7 @@ class Renderer:
         return self._crossings[light.sheet]
 
     def _surfaces(self, pose: SensorPose, segment: RaySegment, ends: list[SheetLight]) -> list[Float]:
-        """Return irradiance per ray of surfaces near the sheets for `LightSources`; ``ends`` is the light there."""
+        """Return irradiance per ray of surfaces near the sheets for `IndirectLight`; ``ends`` is the light there."""
         bsdf = segment.si.bsdf()
         seen = segment.weight * dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, 0.0))
         parts = []
@@ -471,32 +453,6 @@ class Renderer:
         return [sum(each, mi.Float(0.0)) for each in zip(*parts, strict=True)]
 
     # --- lamp ---------------------------------------------------------------------------------------------------------
-
-    def _render_lamp_frame(
-        self, pose: SensorPose, *, spp: int, ambient: bool = False, pattern: Float | None = None
-    ) -> np.ndarray:
-        """Return the light (H, W) of lamp or daylight in W/mm2; only pixels with changes are sampled finely."""
-        begin_kernels()
-        bundle, shape = self.view.trace_grid(1)
-        segment = next(self._segments(pose, bundle, None))
-        value = self._compute_even_light(segment, ambient, pattern)
-        depth = dr.select(segment.valid, self.view.depth_mm(segment.end()), dr.nan)
-        dr.eval(value, depth)
-        nodes = value.numpy().reshape(shape)
-        low, high = combine_corners(np.minimum, nodes), combine_corners(np.maximum, nodes)
-        changes = high - low > CHANGE_SHARE * nodes.max()
-        if self.effects.defocus:
-            changes = dilate_cells(changes, self._blur_px(changes, depth.numpy().reshape(shape)), cell_px=1)
-        if pose.travel is not None:
-            changes[:] = True  # motion may change any pixel
-        image = 0.25 * combine_corners(np.add, nodes)
-
-        def evenly_lit(pose: SensorPose, bundle: Rays, after_s: Float | None, pixel: UInt32) -> tuple[Float]:
-            return (self._compute_even_light(next(self._segments(pose, bundle, after_s)), ambient, pattern),)
-
-        for rows, columns in _split_pixels(*find_marked(changes), spp=spp):
-            image[rows, columns] = self._render_pixels(evenly_lit, pose, rows, columns, spp=spp, shifted=True)()[0]
-        return image
 
     def _compute_even_light(self, segment: RaySegment, ambient: bool, pattern: Float | None) -> Float:
         """Return the irradiance per ray in W/mm2 for evenly lit surfaces, seen through the water and its veiling light.
@@ -516,7 +472,7 @@ class Renderer:
         if self.effects.haze and self.scattering.coefficient > 0:
             scattered = self.scattering.coefficient * (1 if ambient else self.scattering.backward_share)
             radiance += opaque(scattered / self.scattering.extinction) * (1 - left)
-        if self._uneven_lamp and not ambient:
+        if self._flaws.uneven_lamp and not ambient:
             radiance *= self._lamp_share(segment)
         return segment.weight * level * radiance
 
@@ -542,7 +498,7 @@ class Renderer:
         x, y = self.view.slopes(mi.Point3f(segment.origin + segment.direction * length))
         corner = self.sensor.camera.corner_slope()
         squared = dr.square(x / corner - _SPOT_ASIDE) + dr.square(y / corner)
-        return dr.exp(math.log(1 - self._uneven_lamp) * squared)
+        return dr.exp(math.log(1 - self._flaws.uneven_lamp) * squared)
 
     # --- pixels -------------------------------------------------------------------------------------------------------
 
@@ -554,29 +510,33 @@ class Renderer:
         sources: list[Light],
         *,
         spp: int,
-        lines: SurfaceLines | None = None,
+        lines: np.ndarray | None = None,
     ) -> Callable[[], np.ndarray]:
         """Render the stripe; return a function that fetches the means (K, P) of `_stripe_sums` over pixels.
 
         Rendering is asynchronous. In a wide stripe, pixels with smooth light take few samples, unless the light of
         ``lines`` needs all.
         """
-        count = _STRIPE_SUMS if lines is None else _STRIPE_SUMS + _LINE_SUMS
+        count, planes = _STRIPE_SUMS, None
+        if lines is not None:
+            points, normals = lines
+            offset = np.sum(normals * points, axis=1, keepdims=True)
+            count, planes = count + _LINE_SUMS, np.concatenate([normals, offset], axis=1).astype(np.float32)
 
         def start(where: np.ndarray, spp: int) -> Callable[[], np.ndarray]:
             found: list[Callable[[], np.ndarray]] = []
             for part in _split_pixels(rows[where], columns[where], spp=spp):
                 if found:
                     dr.sync_thread()  # limits memory to the samples of one part
-                planes = None if lines is None else to_jit(mi.Float, lines.planes(self._line_numbers(*part)))
-                found.append(self._render_pixels(self._stripe_sums, pose, *part, sources, planes, spp=spp))
+                of_pixels = None if planes is None else to_jit(planes[self._line_numbers(*part)])
+                found.append(self._render_pixels(self._stripe_sums, pose, *part, sources, of_pixels, spp=spp))
             return lambda: np.concatenate([np.zeros((count, 0), np.float32), *(means() for means in found)], axis=1)
 
         everywhere, all_lines = np.arange(len(rows)), self.sensor.camera.lines()
         if lines is not None or len(rows) < _WIDE_PX * all_lines or spp < _LEAST_SPP * _FEWER_SAMPLES:
             return start(everywhere, spp)
         sums = start(everywhere, spp // _FEWER_SAMPLES)()
-        image = np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
+        image = np.zeros(self._size, np.float32)
         image[rows, columns] = sums[0]
         bends = np.zeros(image.shape, np.uint8)
         for along_x, along_y in ((2, 0), (0, 2)):
@@ -597,8 +557,8 @@ class Renderer:
     ) -> tuple[Float, ...]:
         """Return irradiance per ray of surfaces seen directly or in mirrors, plain and weighted for speckle.
 
-        The weights are polarisation and roughness of the surfaces. With ``planes`` of the pixels' lines, `LineLight`
-        follows.
+        The weights are polarisation and roughness of the surfaces. With ``planes`` of the pixels' lines, samples of
+        `render_line_light` follow.
         """
         total, polarised, rough = mi.Float(0.0), mi.Float(0.0), mi.Float(0.0)
         of_line: tuple[Float, ...] = ()
@@ -620,7 +580,7 @@ class Renderer:
         value: Float,
         plane: Vector4f,
     ) -> tuple[Float, Float, Float]:
-        """Return the samples of `LineLight`; ``value`` is the light of all ``sources`` on the segments' ends."""
+        """Return samples for `render_line_light`; ``value`` is the light of all ``sources`` on the segments' ends."""
         light = sources[0]
         if len(sources) > 1 or len(light.sheet.parts) > 1:
             value = segment.weight * self._radiance(pose, segment, [light], after_s, lobes=False)
@@ -654,18 +614,18 @@ class Renderer:
         axes = make_lattice(spp, 2 + 2 * self.effects.defocus + (pose.travel is not None))
         places = np.zeros((spp, 4))
         places[:, : 2 + 2 * self.effects.defocus] = axes[: 2 + 2 * self.effects.defocus].T
-        across, down, u, v = dr.gather(mi.Vector4f, to_jit(mi.Float, places), sample)
-        x, y = dr.gather(mi.Point2f, to_jit(mi.Float, np.stack([columns, rows], axis=1)), pixel)
+        across, down, u, v = dr.gather(mi.Vector4f, to_jit(places), sample)
+        x, y = dr.gather(mi.Point2f, to_jit(np.stack([columns, rows], axis=1)), pixel)
         pupil = None
         if self.effects.defocus:
             if shifted:
-                shift_u, shift_v = dr.gather(mi.Point2f, to_jit(mi.Float, pupil_shifts(rows, columns).T), pixel)
+                shift_u, shift_v = dr.gather(mi.Point2f, to_jit(pupil_shifts(rows, columns).T), pixel)
                 u, v = u + shift_u, v + shift_v
                 u, v = u - dr.floor(u), v - dr.floor(v)
             pupil = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(u, v))
         after_s = None
         if pose.travel is not None:
-            after_s = pose.travel.compute_times(y, dr.gather(mi.Float, to_jit(mi.Float, axes[-1]), sample))
+            after_s = pose.travel.compute_times(y, dr.gather(mi.Float, to_jit(axes[-1]), sample))
         bundle = self.view.trace_bundle(x + across - 0.5, y + down - 0.5, pupil)
         values = light(pose, bundle, after_s, pixel, *rest)
         dr.eval(values)  # together: separate sums would trace the rays again
@@ -689,10 +649,6 @@ class Renderer:
         if reach != 1:
             sigma = sigma * opaque(reach)
         return dr.select(segment.valid, here.distance_mm / sigma, dr.inf)
-
-    def _expand_cells(self, cells: np.ndarray) -> np.ndarray:
-        """Expand values of grid cells to pixels (H, W)."""
-        return expand_cells(cells, self.sensor.camera.height_px, self.sensor.camera.width_px)
 
 
 def _split_pixels(rows: np.ndarray, columns: np.ndarray, *, spp: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -65,10 +65,6 @@ class SheetLight:
     normal: Vector3f
     exit_mm: Float
 
-    def main_irradiance(self) -> Float:
-        """Return the irradiance in W/mm2 if all power were in the main part of the sheet."""
-        return self.in_middle * dr.exp(-0.5 * dr.square(self.distance_mm / self.sigma_mm))
-
 
 class Sheet:
     """The lit surface of a laser in a medium: of the sensor's main laser, or of ``laser``, another laser of the sensor.
@@ -292,7 +288,7 @@ class PowerTable:
         self._low, self._step, self._power_per_step = opaque(low), opaque(step), opaque(power_w / step)
         share = density / np.trapezoid(density)
         below = np.concatenate([[0.0], np.cumsum(0.5 * (share[1:] + share[:-1]))])
-        self._share, self._below = to_jit(mi.Float, share), to_jit(mi.Float, below / below[-1])
+        self._share, self._below = to_jit(share), to_jit(below / below[-1])
 
     def evaluate(self, x: Float) -> Float:
         """Return the power in W per unit of the coordinate."""

@@ -132,8 +132,8 @@ class AngleTable:
     @classmethod
     def join(cls, *tables: PhaseTable) -> list[AngleTable]:
         """Return tables that share the same arrays."""
-        log_density = to_jit(mi.Float, np.concatenate([each.log_density for each in tables]))
-        cumulative = to_jit(mi.Float, np.concatenate([each.cumulative for each in tables]))
+        log_density = to_jit(np.concatenate([each.log_density for each in tables]))
+        cumulative = to_jit(np.concatenate([each.cumulative for each in tables]))
         return [
             cls(log_density, cumulative, opaque(each.cumulative[0] / FORWARD_SR), mi.UInt32(k * NODES))
             for k, each in enumerate(tables)

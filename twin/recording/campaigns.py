@@ -212,7 +212,7 @@ def make_folder(folder: Path) -> Path:
 def keep_to_plan(
     folder: Path, plan: dict[str, JsonValue], files: set[Path], *, recorded: str, called: str, overwrite: bool
 ) -> None:
-    """Write the settings ``plan`` of a folder's contents, or check that they are unchanged.
+    """Write the settings ``plan`` of an existing folder's contents, or check that they are unchanged.
 
     ``files`` belong to the plan, and ``recorded`` is the glob pattern of such files, which messages call ``called``.
     Raises DescriptionError if the folder contains files of another plan, and ``overwrite`` does not replace all of
@@ -221,10 +221,7 @@ def keep_to_plan(
     path = folder / PLAN
     text = json.dumps(plan, indent=2) + "\n"
     plan = json.loads(text)
-    try:
-        found = set(folder.glob(recorded))
-    except OSError as error:
-        raise OutputError(f"cannot use the folder {folder}: {error.strerror}") from error
+    found = set(folder.glob(recorded))
     try:
         known = read_json(path, called="plan") if path.is_file() else None
     except CaptureError:

@@ -9,7 +9,7 @@ import numpy as np
 from twin.backend.arrays import Float, UInt32, to_jit, to_numpy
 from twin.light.image_sampling import find_marked
 from twin.light.pose import SensorPose, Travel
-from twin.light.renderer import Renderer, SurfaceLines
+from twin.light.renderer import Renderer
 from uwlts.model.placement import camera_from_object
 from uwlts.storage.truth import TruthStatus
 
@@ -44,9 +44,9 @@ class FrameTruth:
     visible_fraction: np.ndarray
     mixed_fraction: np.ndarray
 
-    def surface_lines(self) -> SurfaceLines:
-        """Return points and normals of the profile lines."""
-        return SurfaceLines(self.point_mm, self.normal)
+    def surface_lines(self) -> np.ndarray:
+        """Return points and normals (2, L, 3) of the profile lines."""
+        return np.stack([self.point_mm, self.normal])
 
 
 def make_empty_truth(lines: int) -> FrameTruth:
@@ -140,12 +140,10 @@ def mark_run(light: np.ndarray, centre: np.ndarray, share: float) -> np.ndarray:
 def _distance_slopes(renderer: Renderer, pose: SensorPose, truth: FrameTruth, lines: np.ndarray) -> np.ndarray:
     """Return the derivative of the sheet's distance on the lines' tangent planes across the stripe, in mm/px."""
     camera, distance = renderer.sensor.camera, []
-    point, normal = (
-        mi.Vector3f(*(to_jit(mi.Float, axis) for axis in v[lines].T)) for v in (truth.point_mm, truth.normal)
-    )
-    at = to_jit(mi.Float, lines)
+    point, normal = (mi.Vector3f(*(to_jit(axis) for axis in v[lines].T)) for v in (truth.point_mm, truth.normal))
+    at = to_jit(lines)
     for aside in (-0.5, 0.5):
-        across = to_jit(mi.Float, truth.centre_px[lines] + aside)
+        across = to_jit(truth.centre_px[lines] + aside)
         x, y = (at, across) if camera.stripe_along == "width" else (across, at)
         bundle = renderer.view.trace_bundle(x, y)
         ray = pose.ray(
@@ -206,15 +204,15 @@ def find_crossings(renderer: Renderer, scene_from_object: np.ndarray, *, travel:
     marked[line, cell] = marked[line, cell + 1] = True
     edge_line, edge = find_marked(marked)
     edges = np.empty(marked.shape, np.float32)
-    edges[edge_line, edge] = distance(to_jit(mi.Float, edge - 0.5), to_jit(mi.Float, edge_line)).numpy()
+    edges[edge_line, edge] = distance(to_jit(edge - 0.5), to_jit(edge_line)).numpy()
     below, above = edges[line, cell], edges[line, cell + 1]
     bracketed = (below <= 0) != (above <= 0)
     bracketed &= np.isfinite(below) & np.isfinite(above)
     line, cell, below, above = line[bracketed], cell[bracketed], below[bracketed], above[bracketed]
     if len(line) == 0:
         return nothing
-    at, low, high = to_jit(mi.Float, line), to_jit(mi.Float, cell - 0.5), to_jit(mi.Float, cell + 0.5)
-    below, above = to_jit(mi.Float, below), to_jit(mi.Float, above)
+    at, low, high = to_jit(line), to_jit(cell - 0.5), to_jit(cell + 0.5)
+    below, above = to_jit(below), to_jit(above)
 
     def narrowed(low: Float, high: Float, below: Float, above: Float, at: Float, left: UInt32) -> tuple[Float, ...]:
         centre = low + (high - low) * below / (below - above)
@@ -245,16 +243,14 @@ def find_crossings(renderer: Renderer, scene_from_object: np.ndarray, *, travel:
     return Crossings(*(values[good] for values in arrays))
 
 
-def depth_map(renderer: Renderer, scene_from_object: np.ndarray) -> np.ndarray:
-    """Return the camera-frame z in mm (H, W), float32, of the surface at every pixel centre; NaN if there is none."""
-    return find_visible_surfaces(renderer, scene_from_object)[0]
-
-
 def find_visible_surfaces(renderer: Renderer, scene_from_object: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return depth as `depth_map`, and the object number (H, W), -1 for none, at every pixel centre."""
+    """Return depth and object number (H, W) of the surface at every pixel centre; NaN and -1 if there is none.
+
+    The depth is the camera-frame z in mm, float32.
+    """
     camera = renderer.sensor.camera
     x, y = np.meshgrid(np.arange(camera.width_px, dtype=np.float32), np.arange(camera.height_px, dtype=np.float32))
-    bundle = renderer.view.trace_bundle(to_jit(mi.Float, x), to_jit(mi.Float, y))
+    bundle = renderer.view.trace_bundle(to_jit(x), to_jit(y))
     ray = SensorPose(scene_from_object).ray(bundle.origin, bundle.direction)
     hit = renderer.objects.scene.ray_intersect_preliminary(ray)
     depth = renderer.view.depth_mm(mi.Point3f(bundle.origin + bundle.direction * hit.t))
@@ -278,7 +274,7 @@ def project_points(renderer: Renderer, scene_from_object: np.ndarray, points_mm:
     for _ in range(_POINT_STEPS):
         pixels = np.clip(pixels, -0.1 * size, 1.1 * size)
         at = pixels[:, None] + [(0, 0), (1, 0), (0, 1)]
-        bundle = renderer.view.trace_bundle(to_jit(mi.Float, at[..., 0]), to_jit(mi.Float, at[..., 1]))
+        bundle = renderer.view.trace_bundle(to_jit(at[..., 0]), to_jit(at[..., 1]))
         dr.eval(bundle.origin, bundle.direction)
         origin, direction = (
             to_numpy(v).astype(float).reshape(at.shape[:2] + (3,)) for v in (bundle.origin, bundle.direction)
@@ -288,7 +284,7 @@ def project_points(renderer: Renderer, scene_from_object: np.ndarray, points_mm:
         slopes = np.stack([miss[:, 1] - miss[:, 0], miss[:, 2] - miss[:, 0]], axis=2)
         steps = np.einsum("nij,nj->ni", np.linalg.pinv(slopes), miss[:, 0])
         pixels = pixels - steps
-    bundle = renderer.view.trace_bundle(*(to_jit(mi.Float, axis) for axis in pixels.T))
+    bundle = renderer.view.trace_bundle(*(to_jit(axis) for axis in pixels.T))
     hit = renderer.objects.scene.ray_intersect_preliminary(
         SensorPose(scene_from_object).ray(bundle.origin, bundle.direction)
     )

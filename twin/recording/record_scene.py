@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from twin.backend.llvm import preserve_threads
-from twin.recording.frame_truth import FrameTruth, depth_map
+from twin.recording.frame_truth import FrameTruth, find_visible_surfaces
 from twin.recording.sensor_simulator import SensorSimulator, ShotLight, with_window
 from twin.rendering_options import Options
 from twin.scene.description import Scene, medium_of
@@ -47,13 +47,11 @@ def record_scene(
     Raises DesignError or DescriptionError if sensor or scene cannot work, and OutputError if a file exists or cannot be
     written.
     """
-    path = Path(path)
-    if truth_path(path).exists() and not (overwrite or resume):
-        raise OutputError(f"{truth_path(path)} exists already; give another name, or `overwrite` to replace it")
-    motion = scene.motion
+    path, motion = Path(path), scene.motion
     report = motion.course().report if isinstance(motion, Platform) else None
-    if report is not None and trajectory_path(path).exists() and not (overwrite or resume):
-        raise OutputError(f"{trajectory_path(path)} exists already; give another name, or `overwrite` to replace it")
+    for beside in (truth_path(path), *([] if report is None else [trajectory_path(path)])):
+        if beside.exists() and not (overwrite or resume):
+            raise OutputError(f"{beside} exists already; give another name, or `overwrite` to replace it")
     studio = SensorSimulator(as_built or sensor, scene, options)
     # The header contains only what an operator knows: nominal values.
     header = CaptureHeader(
@@ -88,7 +86,7 @@ def record_scene(
     }
     known = isinstance(motion, Platform) and motion.states_covariance
     lines = studio.peak_finder is not None
-    kinds = {"centre_lines": lines, "moving": studio.speed_mm_per_s() != 0, "covariances": known}
+    kinds = {"centre_lines": lines, "moving": motion.stage_speed_mm_s() != 0, "covariances": known}
     files = {"overwrite": overwrite, "resume": resume}
     with (
         CaptureWriter(path, header, dtype=dtype, **kinds, plan=plan, **files) as writer,
@@ -117,8 +115,10 @@ def record_scene(
                 end(index - 1, before)
             before = None
             if light is not None:
-                following = shots[min(index + 1, len(shots) - 1)]
-                dr.set_thread_count(_threads_beside_camera(following, threads))
+                # The many small kernels of a laser image would take the processor from the camera's thread; a lamp
+                # image has few large ones.
+                lamp_next = shots[min(index + 1, len(shots) - 1)].light == "lamp"
+                dr.set_thread_count(threads if lamp_next else min(threads, max(1, (os.cpu_count() or 1) - 1)))
                 before = camera.submit(take, light, shot, index)
         end(len(shots) - 1, before)
         if report is not None:
@@ -132,13 +132,4 @@ def truth_of_recording(studio: SensorSimulator, truths: Sequence[FrameTruth], sh
     """Combine the truths of a recording's frames, with the depth map of the first shot."""
     stacked = {f.name: np.stack([getattr(truth, f.name) for truth in truths]) for f in fields(FrameTruth)}
     poses = np.stack([studio.pose(shot) for shot in shots])
-    return Truth(**stacked, depth_mm=depth_map(studio.renderer, poses[0]), pose=poses)
-
-
-def _threads_beside_camera(shot: Shot, threads: int) -> int:
-    """Return the number of Dr.Jit threads that render a shot while another thread exposes and writes the previous one.
-
-    The many small kernels of a laser image would take the processor from that thread; a lamp image has few large
-    kernels.
-    """
-    return threads if shot.light == "lamp" else min(threads, max(1, (os.cpu_count() or 1) - 1))
+    return Truth(**stacked, depth_mm=find_visible_surfaces(studio.renderer, poses[0])[0], pose=poses)

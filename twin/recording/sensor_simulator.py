@@ -1,12 +1,12 @@
 """Simulation of a sensor in a scene: poses, exposures, noisy images, and the ground truth of each shot."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from typing import Literal, TypeAlias
 
 import numpy as np
 
-from twin.light.illumination import Caustics, reflect_ring
+from twin.light.illumination import reflect_ring
 from twin.light.pose import Travel
 from twin.light.renderer import LaserFrame, Renderer
 from twin.recording.frame_truth import (
@@ -56,16 +56,6 @@ def with_window(sensor: Sensor, *, mounted: bool) -> Sensor:
     return replace_values(sensor, camera={"window": {"mounted": mounted}})
 
 
-def true_pose(scene: Scene, shot: Shot) -> np.ndarray:
-    """Return ``T_scene_object`` (4, 4) of the sensor's OCS at a shot, in the middle of its exposure."""
-    if isinstance(scene.motion, Platform):
-        assert shot.time_s is not None
-        return scene.motion.course().poses(np.array([shot.time_s]))[0]
-    transform = np.eye(4)
-    transform[:3, 3] = shot.travelled_mm * scene.motion.unit_direction()
-    return transform
-
-
 def check_scene(renderer: Renderer, scene: Scene) -> None:
     """Check that a scan reaches the objects.
 
@@ -77,7 +67,7 @@ def check_scene(renderer: Renderer, scene: Scene) -> None:
     nearest, farthest = ((edge - renderer.design.standoff_mm) / axis[2] for edge in (volume.near_mm, volume.far_mm))
     box = renderer.objects.scene.bbox()
     corners = np.array(list(product(*zip(box.min, box.max, strict=True))))
-    inverse = np.linalg.inv([true_pose(scene, shot) for shot in scene.motion.shots()])
+    inverse = np.linalg.inv([scene.motion.pose(shot) for shot in scene.motion.shots()])
     seen = np.einsum("sij,cj->sci", inverse[:, :3, :3], corners) + inverse[:, None, :3, 3]
     low, high = seen.min(axis=1), seen.max(axis=1)
     origin = (inverse @ scene.placements[scene.placement].matrix()[:, 3])[:, 2]
@@ -135,14 +125,7 @@ class SensorSimulator:
         self.scene, self.options = scene, options
         self.medium = medium_of(sensor, scene)
         self.renderer = Renderer(
-            self.sensor,
-            self.medium,
-            scene,
-            effects=options.effects,
-            uneven_lamp=flaws.uneven_lamp,
-            caustics=self._water_surface(),
-            drifting={"particles": flaws.particles, "bubbles": flaws.bubbles},
-            surface_seed=options.seed,
+            self.sensor, self.medium, scene, effects=options.effects, flaws=flaws, seed=options.seed
         )
         check_scene(self.renderer, scene)
         camera, laser = self.sensor.camera, self.sensor.laser
@@ -152,7 +135,9 @@ class SensorSimulator:
         if flaws.dirt and mounted:
             clean = dirt(camera, flaws.dirt, seed=options.seed)
             self._passed = clean if self._passed is None else self._passed * clean
-        self._lamp_ring = self._reflect_lamp() if flaws.lamp_reflection and mounted else None
+        self._lamp_ring = None
+        if flaws.lamp_reflection and mounted:
+            self._lamp_ring = reflect_ring(self.renderer.view, self.sensor, reflectance=flaws.lamp_reflection)
         self._laser_shares = laser_shares(camera.height_px, camera.width_px) if flaws.colour_filter else None
         self.peak_finder = None
         if flaws.camera_3d:
@@ -164,29 +149,6 @@ class SensorSimulator:
         self.exposure_ms = {light: self._exposure(light, probe) for light in dict.fromkeys(scene.motion.lights)}
         longest_ms = max(self.exposure_ms[shot.light] * shot.exposure for shot in scene.motion.shots())
         self.period_s = self._period_s(max(1e-3 * longest_ms, 1 / self.sensor.detector.frame_rate_hz))
-
-    def _reflect_lamp(self) -> np.ndarray:
-        """Return the irradiance (H, W) by the lamp ring that the camera's window reflects."""
-        return reflect_ring(
-            self.renderer.view,
-            self.sensor,
-            irradiance_w_per_m2=self.sensor.lamp.irradiance_w_per_m2,
-            distance_mm=float(camera_from_object(self.sensor)[2, 3]),
-            reflectance=self.options.flaws.lamp_reflection,
-        )
-
-    def _water_surface(self) -> Caustics | None:
-        """Return the waves above the scene; None without daylight or wind."""
-        wind, wavelength = self.options.flaws.caustics, self.sensor.laser.wavelength_nm
-        if wind == 0 or self.medium.kind == "air":
-            return None
-        return Caustics(
-            wind_m_s=wind,
-            depth_mm=1e3 * self.scene.depth_m,
-            index=self.medium.refractive_index(wavelength),
-            scattering_per_mm=self.medium.scattering_per_mm(wavelength),
-            seed=self.options.seed,
-        )
 
     def _period_s(self, shortest_s: float) -> float:
         """Return the time between shots: motion or settling of the platform, exposure and read-out of the camera.
@@ -214,51 +176,31 @@ class SensorSimulator:
 
     def pose(self, shot: Shot) -> np.ndarray:
         """Return ``T_scene_object`` (4, 4) of the sensor's OCS at a shot, in the middle of its exposure."""
-        return true_pose(self.scene, shot)
+        return self.scene.motion.pose(shot)
 
-    def speed_mm_per_s(self) -> float:
-        """Return the speed of the stage along its positions during an exposure; 0 for other platforms."""
-        motion = self.scene.motion
-        if isinstance(motion, Platform):
-            return 0.0
-        return motion.speed_mm_per_s * (1 if motion.step_mm >= 0 else -1)
+    def travel(self, shot: Shot, *, in_water: bool = False) -> Travel | None:
+        """Return the motion of the sensor in the scene, or relative to the water, during the exposure of a shot.
 
-    def travel(self, shot: Shot) -> Travel | None:
-        """Return the motion of the sensor during the exposure of a shot; None if it does not move."""
-        exposure_ms = self.exposure_ms.get(shot.light, 0.0) * shot.exposure
-        motion = self.scene.motion
-        if not isinstance(motion, Platform):
-            return self.travel_at(self.speed_mm_per_s(), exposure_ms=exposure_ms)
-        if not (motion.moves() and self.options.effects.motion):
+        None if it does not move.
+        """
+        motion, current = self.scene.motion, in_water * np.array(self.scene.current_mm_per_s)
+        if not self.options.effects.motion or not (motion.moves() or current.any()):
             return None
-        velocity, turn = motion.course().twist(shot, exposure_s=1e-3 * exposure_ms)
-        return self._travel(velocity, turn, exposure_ms)
+        exposure_ms, velocity, turn = self._exposure_of(shot), np.zeros(3), np.zeros(3)
+        if motion.moves():
+            velocity, turn = motion.twist(shot, exposure_s=1e-3 * exposure_ms)
+        return self.travel_at(velocity - current, turn, exposure_ms=exposure_ms)
 
-    def through_water(self, shot: Shot) -> Travel | None:
-        """Return the motion of the sensor relative to the water during an exposure; None if it does not move."""
-        travel, current = self.travel(shot), np.array(self.scene.current_mm_per_s)
-        if not (self.options.effects.motion and current.any()):
-            return travel
-        if travel is None:
-            return self._travel(-current, None, self.exposure_ms.get(shot.light, 0.0) * shot.exposure)
-        return replace(travel, velocity_mm_s=travel.velocity_mm_s - current)
+    def _exposure_of(self, shot: Shot) -> float:
+        """Return the exposure time of a shot in ms."""
+        return self.exposure_ms[shot.light] * shot.exposure
 
-    def travel_at(self, speed: float, *, exposure_ms: float) -> Travel | None:
-        """Return the motion of the sensor during an exposure at a stage speed in mm/s; None if it does not move."""
-        motion = self.scene.motion
-        if speed == 0 or not self.options.effects.motion or isinstance(motion, Platform):
-            return None
-        return self._travel(speed * motion.unit_direction(), None, exposure_ms)
-
-    def _travel(self, velocity: np.ndarray, turn: np.ndarray | None, exposure_ms: float) -> Travel:
+    def travel_at(self, velocity_mm_s: np.ndarray, turn_rad_s: np.ndarray, *, exposure_ms: float) -> Travel:
+        """Return a motion of the sensor during an exposure."""
         detector = self.sensor.detector
-        return Travel(
-            velocity_mm_s=velocity,
-            turn_rad_s=turn,
-            exposure_s=1e-3 * exposure_ms,
-            row_s=1e-6 * detector.line_time_us if detector.shutter == "rolling" else 0.0,
-            middle_row=(self.sensor.camera.height_px - 1) / 2,
-        )
+        row_s = 1e-6 * detector.line_time_us if detector.shutter == "rolling" else 0.0
+        middle_row = (self.sensor.camera.height_px - 1) / 2
+        return Travel(velocity_mm_s, 1e-3 * exposure_ms, turn_rad_s, row_s=row_s, middle_row=middle_row)
 
     def electrons_per_ms(self, shot: Shot, *, spp: int, seed: int, travel: Travel | None = None) -> np.ndarray:
         """Return the mean photo-electrons per ms (H, W) of a shot."""
@@ -337,9 +279,9 @@ class SensorSimulator:
             spp=self.options.spp,
             seed=seed,
             travel=self.travel(shot),
-            through_water=self.through_water(shot),
+            through_water=self.travel(shot, in_water=True),
             time_s=self._time_s(shot, index),
-            exposure_s=1e-3 * self.exposure_ms[shot.light] * shot.exposure,
+            exposure_s=1e-3 * self._exposure_of(shot),
             with_truth=True,
         )
 
@@ -362,39 +304,36 @@ class SensorSimulator:
             number = course.numbers[shot]
             pose = course.reported[number]
             covariance = None if course.covariance is None else course.covariance[number]
+        seen: Seen = self._render_image(light, shot, index)
+        if self.peak_finder is not None and shot.light == "laser":
+            camera = self.sensor.camera
+            length = camera.height_px if camera.stripe_along == "width" else camera.width_px
+            meant = Coordinates(scale=self.peak_finder.scale_px(), invalid=INVALID)
+            seen = meant.stripe(self.peak_finder.numbers(seen), stripe_along=camera.stripe_along, length_px=length)
         return Frame(
-            self._observe(light, shot, index),
+            seen,
             stage_mm=shot.stage_mm,
             laser_on=shot.light == "laser",
-            exposure_ms=self.exposure_ms[shot.light] * shot.exposure,
+            exposure_ms=self._exposure_of(shot),
             time_s=self._time_s(shot, index),
             pose=pose,
             pose_covariance=covariance,
-            speed_mm_per_s=self.speed_mm_per_s(),
+            speed_mm_per_s=self.scene.motion.stage_speed_mm_s(),
         )
-
-    def _observe(self, light: ShotLight, shot: Shot, index: int) -> Seen:
-        """Return the image of a shot, or the centre line that a 3D camera finds in it."""
-        image = self._render_image(light, shot, index)
-        if self.peak_finder is None or shot.light != "laser":
-            return image
-        camera = self.sensor.camera
-        length = camera.height_px if camera.stripe_along == "width" else camera.width_px
-        meant = Coordinates(scale=self.peak_finder.scale_px(), invalid=INVALID)
-        return meant.stripe(self.peak_finder.numbers(image), stripe_along=camera.stripe_along, length_px=length)
 
     def image(self, shot: Shot, index: int) -> np.ndarray:
         """Return the grey values (H, W) of a shot; noise depends only on seed, position and index."""
         return self._render_image(self.light(shot, index), shot, index)
 
-    def _render_image(self, light: ShotLight, shot: Shot, index: int) -> np.ndarray:
-        electrons_per_ms = self._electrons_per_ms(*light, shot)
-        return self._expose(electrons_per_ms, index, exposure_ms=self.exposure_ms[shot.light] * shot.exposure)
+    def _render_image(self, light: ShotLight, shot: Shot, index: int, *, exposure: float = 1.0) -> np.ndarray:
+        exposure_ms = exposure * self._exposure_of(shot)
+        electrons = exposure_ms * self._electrons_per_ms(*light, shot)
+        return self.detect(electrons, exposure_ms=exposure_ms, noise_seed=[self.options.seed, index])
 
     def expose(self, shot: Shot, index: int, *, exposure: float = 1.0) -> SimulatedImage:
         """Return the image of a shot as `image` does, with its light; ``exposure`` multiplies the exposure time."""
         even, laser = self.light(shot, index)
-        exposure_ms = exposure * self.exposure_ms[shot.light] * shot.exposure
+        exposure_ms = exposure * self._exposure_of(shot)
         nothing = np.zeros_like(even)
 
         def to_electrons(light: np.ndarray, shares: np.ndarray | None = None) -> np.ndarray:
@@ -408,12 +347,8 @@ class SensorSimulator:
         if laser is not None:
             parts = [laser.direct(), laser.haze, laser.scattered - laser.haze, laser.particles]
         parts = [*(to_electrons(part, self._laser_shares) for part in parts), to_electrons(even)]
-        image = self._expose(self._electrons_per_ms(even, laser, shot), index, exposure_ms=exposure_ms)
+        image = self._render_image((even, laser), shot, index, exposure=exposure)
         return SimulatedImage(image, exposure_ms, *parts)
-
-    def _expose(self, electrons_per_ms: np.ndarray, index: int, *, exposure_ms: float) -> np.ndarray:
-        noise_seed = [self.options.seed, index]
-        return self.detect(exposure_ms * electrons_per_ms, exposure_ms=exposure_ms, noise_seed=noise_seed)
 
     def detect(self, electrons: np.ndarray, *, exposure_ms: float, noise_seed: list[int]) -> np.ndarray:
         """Return grey values (H, W) for mean photo-electrons (H, W), with seeded noise if noise is enabled."""

@@ -345,63 +345,47 @@ def find_understated(campaign: Campaign, takes: Sequence[Take]) -> tuple[Underst
     the waist's distance have no key: residuals show them, or they change no position.
     """
     described, built = choose_sensors(campaign.sensor, campaign.as_built)
-    pairs = (*_of_sensor(campaign, described, built), *_of_stage_and_target(campaign, described))
-    found = [*pairs, *_of_media(campaign, takes, built), *_of_steps(campaign, takes)]
+    found = [*_of_hardware(campaign, described, built), *_of_media(campaign, takes, built), *_of_steps(campaign, takes)]
     # Stated values are rounded, as 2.9 K for a half width of 5 K.
     return tuple(each for each in dict.fromkeys(found) if each.deviation > 1.02 * each.expanded)
 
 
-def _of_sensor(campaign: Campaign, described: Sensor, built: Sensor) -> Iterator[Understated]:
-    """Yield deviations of windows, laser and lens, those of the sensor as built included."""
+def _of_hardware(campaign: Campaign, described: Sensor, built: Sensor) -> Iterator[Understated]:
+    """Yield deviations of the sensor, those of the sensor as built included, and of stage and target."""
     drawn, stated, wavelength = campaign.imperfections, described.uncertainty, described.laser.wavelength_nm
     nominal, real = described.camera.window, built.camera.window
-    behind, laser, lens = described.laser.window, built.laser, built.camera.distortion
-    thicker = abs(math.log(laser.waist_radius_mm / described.laser.waist_radius_mm))
+    plain, laser, lens = described.laser, built.laser, built.camera.distortion
+    thicker = math.log(laser.waist_radius_mm / plain.waist_radius_mm)
     turned = max(abs(real.tilt_x_deg - nominal.tilt_x_deg), abs(real.tilt_y_deg - nominal.tilt_y_deg))
     tangential = max(abs(lens.p1 - described.camera.distortion.p1), abs(lens.p2 - described.camera.distortion.p2))
+    # Only a turn about the line changes the direction of the sheet.
+    sheet_turned = laser.window.tilt_y_deg - plain.window.tilt_y_deg
+    # Both turn the travel relative to the target's normal.
+    misaligned = math.hypot(drawn.stage_misalignment_std_deg, drawn.target_tilt_std_deg)
+    window, denser = "the camera's window", real.index(wavelength) - nominal.index(wavelength)
     rows: tuple[tuple[str, str, float, float], ...] = (
-        ("distance of the camera's window", "window_distance_mm", real.distance_mm - nominal.distance_mm, 0.0),
-        ("tilt of the camera's window", "window_tilt_deg", turned, drawn.window_tilt_std_deg),
+        (f"distance of {window}", "window_distance_mm", real.distance_mm - nominal.distance_mm, 0.0),
+        (f"tilt of {window}", "window_tilt_deg", turned, drawn.window_tilt_std_deg),
         (
-            "glass thickness of the camera's window",
+            f"glass thickness of {window}",
             "glass_thickness_mm",
             real.thickness_mm - nominal.thickness_mm,
             drawn.glass_thickness_std_mm,
         ),
-        (
-            "glass index of the camera's window",
-            "glass_index",
-            real.index(wavelength) - nominal.index(wavelength),
-            drawn.glass_index_std,
-        ),
-        # Only a turn about the line changes the direction of the sheet.
-        ("tilt of the laser's window", "laser_window_tilt_deg", laser.window.tilt_y_deg - behind.tilt_y_deg, 0.0),
-        (
-            "tilt of the beam at the line optics",
-            "bow_deg",
-            laser.bow_deg - described.laser.bow_deg,
-            drawn.sheet_bow_std_deg,
-        ),
+        (f"glass index of {window}", "glass_index", denser, drawn.glass_index_std),
+        ("tilt of the laser's window", "laser_window_tilt_deg", sheet_turned, 0.0),
+        ("tilt of the beam at the line optics", "bow_deg", laser.bow_deg - plain.bow_deg, drawn.sheet_bow_std_deg),
         ("relative thickness of the sheet", "sheet_thickness", thicker, drawn.waist_std),
         ("tangential distortion", "tangential", tangential, 0.0),
+        ("position of the stage", "stage_position_mm", 0.0, drawn.stage_position_std_mm),
+        ("scale of the stage", "stage_scale", 0.0, drawn.stage_lead_std),
+        ("direction of the stage", "stage_alignment_deg", 0.0, misaligned),
+        ("bow of the target", "target_bow_mm", 0.0, drawn.target_bow_std_mm),
+        ("stretch of the target", "target_stretch", 0.0, drawn.target_stretch_std),
     )
     for quantity, key, known, std in rows:
-        yield _compare(quantity, key, abs(known) + _NORMAL * std, getattr(stated, key))
-
-
-def _of_stage_and_target(campaign: Campaign, described: Sensor) -> Iterator[Understated]:
-    drawn, stated = campaign.imperfections, described.uncertainty
-    # Both turn the travel relative to the target's normal.
-    turned = math.hypot(drawn.stage_misalignment_std_deg, drawn.target_tilt_std_deg)
-    rows = (
-        ("position of the stage", "stage_position_mm", drawn.stage_position_std_mm, stated.stage_position_mm),
-        ("scale of the stage", "stage_scale", drawn.stage_lead_std, stated.stage_scale),
-        ("direction of the stage", "stage_alignment_deg", turned, stated.stage_alignment_deg),
-        ("bow of the target", "target_bow_mm", drawn.target_bow_std_mm, stated.target_bow_mm),
-        ("stretch of the target", "target_stretch", drawn.target_stretch_std, min(stated.stretch_by_axis())),
-    )
-    for quantity, key, std, known in rows:
-        yield _compare(quantity, key, _NORMAL * std, known)
+        within = min(stated.stretch_by_axis()) if key == "target_stretch" else getattr(stated, key)
+        yield _compare(quantity, key, abs(known) + _NORMAL * std, within)
 
 
 def _of_media(campaign: Campaign, takes: Sequence[Take], built: Sensor) -> Iterator[Understated]:

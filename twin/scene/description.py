@@ -121,13 +121,6 @@ class PrintedPlate(SceneObject, ABC):
     def ink_and_gap_reflectance(self) -> tuple[float, float]:
         """Return the reflectance of printed patches with ink and of patches without."""
 
-    def scale_reflectance(self, scale: float) -> Self:
-        """Return the plate with all reflectances multiplied by ``scale``."""
-        own = set(type(self).model_fields) - set(SceneObject.model_fields)
-        printed = {name: getattr(self, name) for name in own if name.endswith("_reflectance")}
-        values = printed | {"reflectance": self.background_reflectance()}
-        return self.model_copy(update={name: scale * value for name, value in values.items()})
-
     def background_reflectance(self) -> float:
         """Return the reflectance of the plate around the print."""
         return self.finish_properties().reflectance
@@ -287,20 +280,10 @@ def load_scene(
     water: str | float | None = None,
     motion: Motion | Platform | Mapping[str, object] | None = None,
 ) -> Scene:
-    """Read a scene by name or path; the given values replace its own.
+    """Read a scene by the name of a shipped one (``spheres``) or by path; the given values replace its own.
 
-    Parameters
-    ----------
-    name_or_path
-        Name of a shipped scene (``spheres``), or path of a description.
-    placement
-        Name of one of the scene's placements.
-    medium
-        Name of one of the sensor's media.
-    water
-        Name of a water, or a turbidity from 0 (pure) to 3 (harbour).
-    motion
-        Motion of the sensor; a table is validated like one of the file.
+    They are the names of one of the scene's placements and of one of the sensor's media, the name of a water or a
+    turbidity from 0 (pure) to 3 (harbour), and a motion of the sensor. A table is validated like one of the file.
     """
     path = find_description(name_or_path)
     table: dict[str, object] = dict(read_table(path))

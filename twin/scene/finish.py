@@ -135,7 +135,7 @@ def _reflectance(thing: SceneObject, scale: float, field: dict[str, object]) -> 
     ``field`` describes its random variation in the scene.
     """
     if isinstance(thing, PrintedPlate):
-        return pattern_texture(thing.scale_reflectance(scale))
+        return pattern_texture(thing, scale)
     own = thing.finish_properties()
     if field:
         numbers = {
@@ -221,21 +221,35 @@ def view_along_normal(si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
     return straight
 
 
-def pattern_texture(plate: PrintedPlate) -> mi.Texture:
-    """Return the texture of a printed plate; `register_textures` must have been called for the variant."""
-    return mi.load_dict({"type": "target_pattern", "plate": plate.model_dump_json()})
+def pattern_texture(plate: PrintedPlate, scale: float = 1.0) -> mi.Texture:
+    """Return the texture of a printed plate, multiplied by ``scale``.
+
+    `register_textures` must have been called for the variant.
+    """
+    return mi.load_dict({"type": "target_pattern", "plate": plate.model_dump_json(), "scale": scale})
 
 
 def register_textures() -> None:
     """Register the textures ``target_pattern`` and ``random_reflectance`` with the selected Mitsuba variant."""
-    mi.register_texture("target_pattern", _target_pattern())
-    mi.register_texture("random_reflectance", _random_reflectance())
 
+    class ExactTexture(mi.Texture):
+        """Texture of the selected variant that `eval_1` evaluates; ``average`` is its mean."""
 
-def _target_pattern() -> type[mi.Texture]:
-    """Return a texture of the selected variant, from which it derives."""
+        average: float | Float
 
-    class TargetPattern(mi.Texture):
+        def eval(self, si: SurfaceInteraction3f, active: Bool = True) -> Float:
+            return self.eval_1(si, active)
+
+        def mean(self) -> Float:
+            return mi.Float(self.average)
+
+        def is_spatially_varying(self) -> bool:
+            return True
+
+        def to_string(self) -> str:
+            return f"{type(self).__name__}[]"
+
+    class TargetPattern(ExactTexture):
         """Reflectance of a printed plate whose uv coordinates run from 0 to 1 over its bounds.
 
         The print is shifted locally by the error of the nearest target point. Points are assumed to be on a lattice
@@ -243,27 +257,22 @@ def _target_pattern() -> type[mi.Texture]:
         """
 
         def __init__(self, props: mi.Properties):
-            mi.Texture.__init__(self, props)
-            self.plate = cast(PrintedPlate, TypeAdapter(AnyObject).validate_json(str(props["plate"])))
-            target, (first, last) = self.plate.described_target(), self.plate.bounds_mm()
+            ExactTexture.__init__(self, props)
+            plate = cast(PrintedPlate, TypeAdapter(AnyObject).validate_json(str(props["plate"])))
+            self.average = props["scale"] * plate.background_reflectance()
+            target, (first, last) = plate.described_target(), plate.bounds_mm()
             self.middle, self.size, self.first = ((first + last) / 2).tolist(), (last - first).tolist(), first.tolist()
             self.points_end = target.indices.max(axis=0).tolist()
             corner, beside = target.points_at(np.array([(0, 0), (1, 1)]))[:, :2]
             self.corner_point, self.spacing = corner.tolist(), (beside - corner).tolist()
-            self.shift_mm = to_jit(mi.Float, draw_print_errors(self.plate).ravel())
-            patches = _patch_table(self.plate)
+            self.shift_mm = to_jit(draw_print_errors(plate).ravel())
+            patches = _patch_table(plate, props["scale"])
             lists, self.cell_mm = _patches_by_cell(patches, first, last)
             self.rows, self.columns, self.depth = lists.shape
-            self.patches = to_jit(mi.Float, patches[lists])
+            self.patches = to_jit(patches[lists])
 
         def traverse(self, cb: mi.TraversalCallback) -> None:
             cb.put(_SHIFT, self.shift_mm, mi.ParamFlags.NonDifferentiable)
-
-        def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-            pass
-
-        def eval(self, si: SurfaceInteraction3f, active: Bool = True) -> Float:
-            return self.eval_1(si, active)
 
         def eval_1(self, si: SurfaceInteraction3f, active: Bool = True) -> Float:
             x = self.middle[0] + (si.uv.x - 0.5) * self.size[0]
@@ -280,7 +289,7 @@ def _target_pattern() -> type[mi.Texture]:
             column = dr.clip(dr.floor((x - self.first[0]) / self.cell_mm), 0, self.columns - 1)
             row = dr.clip(dr.floor((y - self.first[1]) / self.cell_mm), 0, self.rows - 1)
             start = 2 * mi.UInt32((row * self.columns + column) * self.depth)
-            value = mi.Float(self.plate.background_reflectance())
+            value = mi.Float(self.average)
             for k in range(self.depth):
                 # Adjacent values are read together, in a quarter of the time.
                 middle_x, middle_y, half_width, aspect = dr.gather(mi.Vector4f, self.patches, start + 2 * k, active)
@@ -291,33 +300,18 @@ def _target_pattern() -> type[mi.Texture]:
                 value = dr.select(inside, reflectance, value)
             return value
 
-        def mean(self) -> Float:
-            return mi.Float(self.plate.background_reflectance())
-
-        def is_spatially_varying(self) -> bool:
-            return True
-
-        def to_string(self) -> str:
-            return f"TargetPattern[{type(self.plate.described_target()).__name__}]"
-
-    return TargetPattern
-
-
-def _random_reflectance() -> type[mi.Texture]:
-    """Return a texture of the selected variant, from which it derives."""
-
-    class RandomReflectance(mi.Texture):
+    class RandomReflectance(ExactTexture):
         """Log-normal reflectance, limited to 1, with patches of another one, both times a scale.
 
         Both follow from Gaussian fields of plane waves in the scene.
         """
 
         def __init__(self, props: mi.Properties):
-            mi.Texture.__init__(self, props)
+            ExactTexture.__init__(self, props)
             table = json.loads(str(props["table"]))
             mottle, patches = table.get("mottle_waves"), table.get("patch_waves")
-            self.mottle_waves = None if mottle is None else to_jit(mi.Float, np.array(mottle))
-            self.patch_waves = None if patches is None else to_jit(mi.Float, np.array(patches))
+            self.mottle_waves = None if mottle is None else to_jit(np.array(mottle))
+            self.patch_waves = None if patches is None else to_jit(np.array(patches))
             mean, share, scale = table["mean"], table["share"], table["scale"]
             deviation = log_deviation(table["mottle"])
             self.gain, self.most = opaque(deviation * math.sqrt(2 / WAVES)), opaque(scale)
@@ -325,9 +319,6 @@ def _random_reflectance() -> type[mi.Texture]:
             self.level = opaque(table.get("level", 0.0) * math.sqrt(WAVES / 2))
             self.patch = opaque(scale * table["patch"])
             self.average = opaque(scale * (mean + share * (table["patch"] - mean)))
-
-        def eval(self, si: SurfaceInteraction3f, active: Bool = True) -> Float:
-            return self.eval_1(si, active)
 
         def eval_1(self, si: SurfaceInteraction3f, active: Bool = True) -> Float:
             value = mi.Float(self.middle)
@@ -339,16 +330,8 @@ def _random_reflectance() -> type[mi.Texture]:
                 value = dr.select(covered, self.patch, value)
             return value
 
-        def mean(self) -> Float:
-            return self.average
-
-        def is_spatially_varying(self) -> bool:
-            return True
-
-        def to_string(self) -> str:
-            return "RandomReflectance[]"
-
-    return RandomReflectance
+    mi.register_texture("target_pattern", TargetPattern)
+    mi.register_texture("random_reflectance", RandomReflectance)
 
 
 def _sum_waves(waves: Float, p: Point3f, active: Bool) -> Float:
@@ -374,12 +357,12 @@ def _sum_waves(waves: Float, p: Point3f, active: Bool) -> Float:
     return total
 
 
-def _patch_table(plate: PrintedPlate) -> np.ndarray:
+def _patch_table(plate: PrintedPlate, scale: float) -> np.ndarray:
     """Return centre, half width, aspect ratio, roundness and reflectance (N + 1, 8) of patches.
 
-    The last row is a patch that is never hit.
+    Reflectances are multiplied by ``scale``. The last row is a patch that is never hit.
     """
-    ink, gap = plate.ink_and_gap_reflectance()
+    ink, gap = (scale * each for each in plate.ink_and_gap_reflectance())
     patches = plate.described_target().patches()
     low, high = (
         np.array([(getattr(p, f"x_{end}_mm"), getattr(p, f"y_{end}_mm")) for p in patches]) for end in ("min", "max")
@@ -426,7 +409,7 @@ def shift_points(scene: mi.Scene, plate: PrintedPlate, *, mm_per_px: float, imag
     noise = mm_per_px * plate.detection_std_px * _standard_normal(plate, 1, image)
     parameters = mi.traverse(scene)
     (key,) = (key for key in dict(parameters) if key.endswith(_SHIFT))
-    parameters[key] = to_jit(mi.Float, (draw_print_errors(plate) + noise).ravel())
+    parameters[key] = to_jit((draw_print_errors(plate) + noise).ravel())
     parameters.update()
 
 

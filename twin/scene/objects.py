@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
-from twin.backend.arrays import Bool, Float, Int32, SurfaceInteraction3f, UInt32, scalar_transform, to_jit
+from twin.backend.arrays import Bool, Float, Int32, SurfaceInteraction3f, UInt32, to_jit
 from twin.scene.description import AnyObject, Ball, Block, CirclePlate, Mesh, Pipe, Plate, Scene, TargetPlate
 from twin.scene.finish import albedo_parts, body_spread, finish_bsdf, register_textures, view_along_normal
 from twin.scene.forms.triangles import bowed_plate, rounded_box
@@ -199,7 +199,7 @@ def _by_registry(shapes: list[mi.Shape], values: np.ndarray) -> Float:
     number = [int(_registry_number(mi.ShapePtr(shape))[0]) for shape in shapes]
     table = np.zeros((max(number) + 1, *values.shape[1:]), np.float32)
     table[number] = values
-    flat = to_jit(mi.Float, table)
+    flat = to_jit(table)
     dr.eval(flat)
     return flat
 
@@ -213,7 +213,7 @@ def _shape(thing: AnyObject, pose: np.ndarray, bsdf: mi.BSDF) -> mi.Shape:
                 matrix[:3, :3] = np.eye(3)  # Mitsuba mistakes rounding errors of a rotated sphere for shear
             matrix, kind = matrix @ _make_scaling(*[thing.diameter_mm / 2] * 3), "sphere"
         case Block() if thing.edge_radius_mm > 0:
-            return _mesh(thing, pose, bsdf)
+            return _mesh(rounded_box(np.array(thing.size_mm), radius_mm=thing.edge_radius_mm), pose, bsdf)
         case Block():
             matrix, kind = pose @ _make_scaling(*(side / 2 for side in thing.size_mm)), "cube"
         case Pipe():
@@ -221,31 +221,34 @@ def _shape(thing: AnyObject, pose: np.ndarray, bsdf: mi.BSDF) -> mi.Shape:
             matrix[0, 3] = -thing.length_mm / 2
             matrix, kind = pose @ matrix, "cylinder"
         case CirclePlate() | TargetPlate() if thing.bow_mm != 0:
-            return _mesh(thing, pose, bsdf)
+            return _mesh(bowed_plate(*thing.bounds_mm(), bow_mm=thing.bow_mm), pose, bsdf)
         case CirclePlate() | TargetPlate():
             first, last = thing.bounds_mm()
             matrix = _FACING_SENSOR @ _make_scaling(*(last - first) / 2, 1)
             matrix[:2, 3] = (first + last) / 2
             matrix, kind = pose @ matrix, "rectangle"
         case Mesh() | FreeForm():
-            return _mesh(thing, pose, mi.load_dict({"type": "twosided", "bsdf": bsdf}))
+            surface = thing.surface() if isinstance(thing, FreeForm) else _surface_from_file(thing)
+            return _mesh(surface, pose, mi.load_dict({"type": "twosided", "bsdf": bsdf}))
         case Plate():
-            matrix, kind = (
-                pose @ _FACING_SENSOR @ _make_scaling(thing.width_mm / 2, thing.height_mm / 2, 1),
-                "rectangle",
-            )
+            matrix = pose @ _FACING_SENSOR @ _make_scaling(thing.width_mm / 2, thing.height_mm / 2, 1)
+            kind = "rectangle"
         case _:
             assert_never(thing)
-    return mi.load_dict({"type": kind, "to_world": scalar_transform(matrix), "bsdf": bsdf})
+    return mi.load_dict({"type": kind, "to_world": mi.ScalarTransform4f(matrix), "bsdf": bsdf})
 
 
-def _mesh(thing: Block | Mesh | FreeForm | CirclePlate | TargetPlate, pose: np.ndarray, bsdf: mi.BSDF) -> mi.Mesh:
-    """Return a triangle mesh with its vertices in scene coordinates."""
-    vertices, faces, uv = _surface(thing)
+def _mesh(surface: tuple[np.ndarray | None, ...], pose: np.ndarray, bsdf: mi.BSDF) -> mi.Mesh:
+    """Return a triangle mesh with its vertices in scene coordinates.
+
+    ``surface`` has vertices (V, 3) in the object's own frame and faces (F, 3), and may have texture coordinates (V, 2).
+    """
+    vertices, faces, uv = (*surface, None)[:3]
+    assert vertices is not None and faces is not None
     vertices = vertices @ pose[:3, :3].T + pose[:3, 3]
     properties = mi.Properties()
     properties["bsdf"] = bsdf
-    mesh = mi.Mesh(type(thing).__name__, len(vertices), len(faces), properties, has_vertex_texcoords=uv is not None)
+    mesh = mi.Mesh("mesh", len(vertices), len(faces), properties, has_vertex_texcoords=uv is not None)
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = np.ravel(vertices).astype(np.float32)
     parameters["faces"] = np.ravel(faces).astype(np.uint32)
@@ -253,23 +256,6 @@ def _mesh(thing: Block | Mesh | FreeForm | CirclePlate | TargetPlate, pose: np.n
         parameters["vertex_texcoords"] = np.ravel(uv).astype(np.float32)
     parameters.update()
     return mesh
-
-
-def _surface(
-    thing: Block | Mesh | FreeForm | CirclePlate | TargetPlate,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Return vertices (V, 3) in the object's own frame, faces (F, 3), and texture coordinates (V, 2) or None."""
-    match thing:
-        case FreeForm():
-            return *thing.surface(), None
-        case Block():
-            return *rounded_box(np.array(thing.size_mm), radius_mm=thing.edge_radius_mm), None
-        case CirclePlate() | TargetPlate():
-            return bowed_plate(*thing.bounds_mm(), bow_mm=thing.bow_mm)
-        case Mesh():
-            return _surface_from_file(thing)
-        case _:
-            assert_never(thing)
 
 
 def _surface_from_file(thing: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
@@ -318,23 +304,15 @@ def _require_surface(part: trimesh.Trimesh, path: str) -> None:
 
 
 def _mirror_faces(thing: AnyObject, pose: np.ndarray) -> Iterator[MirrorFace]:
-    """Yield the mirrors of one object at its pose (4, 4) in the scene."""
-    if thing.mirror_share() == 0:
-        return
-    match thing:
-        case Block():
-            half = np.array(thing.size_mm) / 2
-            for axes in _BLOCK_FACES:
-                face = np.eye(4)
-                face[:3, :3], face[:3, 3] = axes, axes[:, 2] * half
-                yield MirrorFace(pose @ face, np.abs(axes.T @ half)[:2], thing.mirror_share())
-        case Plate():
-            half = np.array([thing.width_mm, thing.height_mm]) / 2
-            yield MirrorFace(pose @ _FACING_SENSOR, half, thing.mirror_share())
-        case Ball() | Pipe() | Mesh() | CirclePlate() | TargetPlate() | FreeForm():
-            raise NotImplementedError(f"a {thing.kind} has no flat face that could be a mirror")
-        case _:
-            assert_never(thing)
+    """Yield the mirrors of one object at its pose (4, 4) in the scene; only flat objects have any."""
+    if isinstance(thing, Block) and thing.mirror > 0:
+        half = np.array(thing.size_mm) / 2
+        for axes in _BLOCK_FACES:
+            face = np.eye(4)
+            face[:3, :3], face[:3, 3] = axes, axes[:, 2] * half
+            yield MirrorFace(pose @ face, np.abs(axes.T @ half)[:2], thing.mirror)
+    elif isinstance(thing, Plate) and thing.mirror > 0:
+        yield MirrorFace(pose @ _FACING_SENSOR, np.array([thing.width_mm, thing.height_mm]) / 2, thing.mirror)
 
 
 def _make_scaling(*factors: float) -> np.ndarray:

@@ -5,7 +5,6 @@ Formulas of the vehicle follow T. I. Fossen, Handbook of Marine Craft Hydrodynam
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
@@ -55,7 +54,6 @@ def sample_waves(sea: Sea, rng: np.random.Generator) -> Callable[[np.ndarray], n
     H): S(w) = 5/16 H^2 w0^4 w^-5 exp(-1.25 (w0 / w)^4). Deep-water waves decay with depth by exp(-w^2 depth / g). Each
     component is a sinusoid of random phase. Frequencies are random within bands, so that the motion is not periodic.
     """
-    still = sea.significant_height_mm == 0 and sea.tilt_deg == 0
     height = max(sea.significant_height_mm, 100.0) * 1e-3
     peak = 0.4 * np.sqrt(GRAVITY_M_S2 / height)
     edges = np.linspace(0.5 * peak, 3.0 * peak, _COMPONENTS + 1)
@@ -70,10 +68,7 @@ def sample_waves(sea: Sea, rng: np.random.Generator) -> Callable[[np.ndarray], n
     towards = np.radians(sea.towards_deg)
 
     def evaluate(times: np.ndarray) -> np.ndarray:
-        found = np.zeros((len(times), 6))
-        if still:
-            return found
-        turns = np.multiply.outer(times, frequency)
+        found, turns = np.zeros((len(times), 6)), np.multiply.outer(times, frequency)
         surge = np.cos(turns + phases) @ size
         found[:, 0], found[:, 1] = surge * np.cos(towards), surge * np.sin(towards)
         found[:, 2] = np.sin(turns + phases) @ size
@@ -105,24 +100,6 @@ class Navigation(Description):
     aided_time_s: Positive = 60.0
 
 
-@dataclass(frozen=True, eq=False)
-class Drift:
-    """Errors of the reported pose at times: displacement in mm and rotation in rad about the scene's axes."""
-
-    times_s: np.ndarray
-    values: np.ndarray
-    covariances: np.ndarray
-
-    def errors(self, times_s: np.ndarray) -> np.ndarray:
-        """Return linearly interpolated errors (N, 6)."""
-        return interpolate_values(self.times_s, self.values, times_s)
-
-    def covariance(self, times_s: np.ndarray) -> np.ndarray:
-        """Return the covariances (N, 6, 6) stated by the navigation."""
-        flat = self.covariances.reshape(len(self.times_s), -1)
-        return interpolate_values(self.times_s, flat, times_s).reshape(-1, 6, 6)
-
-
 def simulate_drift(
     navigation: Navigation,
     poses: Callable[[np.ndarray], np.ndarray],
@@ -130,8 +107,11 @@ def simulate_drift(
     lead_s: float,
     lasting_s: float,
     rng: np.random.Generator,
-) -> Drift:
+) -> tuple[Callable[[np.ndarray], np.ndarray], Callable[[np.ndarray], np.ndarray]]:
     """Simulate the navigation errors of a vehicle with true poses, starting from 0 at ``lead_s`` before time 0.
+
+    Two functions of times (N,) are returned: linearly interpolated errors (N, 6) of the reported pose, displacement in
+    mm and rotation in rad about the scene's axes; and their covariances (N, 6, 6) as the navigation states them.
 
     The state contains errors of position (3), roll and pitch (2) and heading, and biases of velocity (2) and gyro. It
     is propagated with its covariance: x' = F x + w, P' = F P F^T + Q (Farrell, sections 4.6 and 4.9). Depth, roll and
@@ -154,14 +134,17 @@ def simulate_drift(
     drawn = np.sqrt(noise) * rng.standard_normal((len(times), 9))
     step = np.diag([1.0, 1.0, aided, aided, aided, 1.0, biased, biased, biased])
     step[[0, 1, 5], [6, 7, 8]] = _STEP_S
-    values, covariances = np.empty((len(times), 9)), np.empty((len(times), 9, 9))
+    values, covariances = np.empty((len(times), 6)), np.empty((len(times), 36))
     for number, (x, y, _) in enumerate(velocity):
-        values[number], covariances[number] = state, spread
+        values[number], covariances[number] = state[:6], spread[:6, :6].ravel()
         # A heading error e rotates the velocity v: the position error changes by e z x v.
         step[0, 5], step[1, 5] = -y * _STEP_S, x * _STEP_S
         state = step @ state + drawn[number]
         spread = step @ spread @ step.T + np.diag(noise)
-    return Drift(times, values[:, :6], covariances[:, :6, :6])
+    return (
+        lambda at: interpolate_values(times, values, at),
+        lambda at: interpolate_values(times, covariances, at).reshape(-1, 6, 6),
+    )
 
 
 class Vehicle(Route):
@@ -180,7 +163,7 @@ class Vehicle(Route):
 
     @model_validator(mode="after")
     def _moves(self) -> "Vehicle":
-        if self.stops:
+        if not self.moves():
             raise ValueError("a vehicle does not stop: give speed_mm_per_s, or a trajectory")
         return self
 
@@ -193,12 +176,9 @@ class Vehicle(Route):
             vibrations = sizes * np.sin(2 * np.pi * self.vibration_hz * times[:, None] + phases)
             return displace_poses(commanded(times), waves(times) + vibrations)
 
-        drift = simulate_drift(self.navigation, true, lead_s=2 * LEAD_S, lasting_s=float(self._knots[0][-1]), rng=rng)
-
-        def reported(times: np.ndarray) -> np.ndarray:
-            return displace_poses(true(times), drift.errors(times))
-
-        return PlatformMotion(true, reported, drift.covariance)
+        lasting_s = float(self._knots[0][-1])
+        errors, covariance = simulate_drift(self.navigation, true, lead_s=2 * LEAD_S, lasting_s=lasting_s, rng=rng)
+        return PlatformMotion(true, lambda times: displace_poses(true(times), errors(times)), covariance)
 
 
 # --- linear guide and rotary table ------------------------------------------------------------------------------------
@@ -285,9 +265,8 @@ class RotaryTable(Platform):
         turn = abs(float(table.get("turn_deg", 360.0))) or 360.0
         return table | {"frame_rate_hz": float(table["speed_deg_per_s"]) * steps / turn}
 
-    @property
-    def stops(self) -> bool:
-        return self.speed_deg_per_s == 0
+    def moves(self) -> bool:
+        return self.speed_deg_per_s > 0
 
     def places(self) -> int:
         return self.count
@@ -299,29 +278,25 @@ class RotaryTable(Platform):
         phases = rng.uniform(0, 2 * np.pi, (6, 2))
 
         def angle(times: np.ndarray) -> np.ndarray:
-            if self.stops:
-                step = self.turn_deg / max(self.count - 1, 1)
-                place = np.clip(np.floor(times / self.stop_s + 1e-9), 0, self.count - 1)
-                return np.radians(self.start_deg + step * place)
-            return np.radians(self.start_deg + np.sign(self.turn_deg) * self.speed_deg_per_s * times)
+            if self.moves():
+                return np.radians(self.start_deg + np.sign(self.turn_deg) * self.speed_deg_per_s * times)
+            step = self.turn_deg / max(self.count - 1, 1)
+            place = np.clip(np.floor(times / self.stop_s + 1e-9), 0, self.count - 1)
+            return np.radians(self.start_deg + step * place)
 
-        def turned(axis: np.ndarray, by: np.ndarray, errors: np.ndarray | None) -> np.ndarray:
-            local = np.tile(np.eye(4), (len(by), 1, 1))
-            local[:, :3, :3] = Rotation.from_rotvec(np.outer(-by, (0, 0, 1))).as_matrix()
-            if errors is not None:
-                # The error motion of the table with the objects, in the frame of the fixed axis.
-                table = np.tile(np.eye(4), (len(by), 1, 1))
-                table[:, :3, :3] = Rotation.from_rotvec(errors[:, 3:]).as_matrix()
-                table[:, :3, 3] = errors[:, :3]
-                local = local @ np.linalg.inv(table)
-            return axis @ local
+        def turned(by: np.ndarray) -> np.ndarray:
+            about_z = np.column_stack([np.zeros((len(by), 5)), -by])
+            return displace_poses(np.tile(np.eye(4), (len(by), 1, 1)), about_z)
 
         def true(times: np.ndarray) -> np.ndarray:
             by = angle(times)
             waves = np.sin(by[:, None, None] * (1, 2) + phases) @ (1, 1 / 3)
-            return turned(true_axis, by, waves * (*sizes, tilt, tilt, scale))
+            # The error motion of the table with the objects, in the frame of the fixed axis.
+            still = np.tile(np.eye(4), (len(by), 1, 1))
+            table = displace_poses(still, waves * (*sizes, tilt, tilt, scale))
+            return true_axis @ (turned(by) @ np.linalg.inv(table))
 
-        return PlatformMotion(true, lambda times: turned(nominal, angle(times), None))
+        return PlatformMotion(true, lambda times: nominal @ turned(angle(times)))
 
 
 def _axes(along: np.ndarray) -> np.ndarray:
@@ -386,7 +361,7 @@ class Robot(Route):
 
     def draw_motion(self, rng: np.random.Generator) -> PlatformMotion:
         times = self._knots[0]
-        if not self.stops:
+        if self.moves():
             times = np.linspace(-LEAD_S, times[-1] + LEAD_S, 2 + int((times[-1] + 2 * LEAD_S) / _ARC_S))
         base, links = self.base.matrix(), np.array(self.links)
         angles = _joint_angles(np.linalg.inv(base) @ self.command_poses()(times), links)
@@ -398,19 +373,17 @@ class Robot(Route):
         repeat = np.radians(self.joint_repeat_std_deg) * rng.standard_normal((places, 6))
         phases = rng.uniform(0, 2 * np.pi, 6)
 
-        def over_time(at: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-            if self.stops:
-                return values[find_stop(at, wanted)]
-            return interpolate_values(at, values, wanted)
+        def at_stops(values: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+            return lambda wanted: values[find_stop(self._knots[0], wanted)]
 
-        smooth = None if self.stops else CubicSpline(times, angles)
+        def between(wanted: np.ndarray) -> np.ndarray:
+            return interpolate_values(self._knots[0], repeat, wanted)
 
-        def joints(wanted: np.ndarray) -> np.ndarray:
-            return over_time(times, angles, wanted) if smooth is None else smooth(wanted)
+        joints, repeated = (CubicSpline(times, angles), between) if self.moves() else map(at_stops, (angles, repeat))
 
         def true(wanted: np.ndarray) -> np.ndarray:
             at = joints(wanted)
-            errors = zero + over_time(self._knots[0], repeat, wanted) + gear * np.sin(2 * self.gear_ratio * at + phases)
+            errors = zero + repeated(wanted) + gear * np.sin(2 * self.gear_ratio * at + phases)
             return base @ _flange(at + errors, wrong)
 
         return PlatformMotion(true, lambda wanted: base @ _flange(joints(wanted), links))

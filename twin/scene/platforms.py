@@ -72,18 +72,30 @@ class Motion(Description):
         for index in range(self.count):
             stage_mm = self.start_mm + index * self.step_mm
             error = self.position_errors_mm[index] if self.position_errors_mm else 0.0
-            for light in self.lights:
-                for exposure in self.bracket if light == "laser" else (1.0,):
-                    yield Shot(stage_mm=stage_mm, travelled_mm=stage_mm + error, light=light, exposure=exposure)
+            for light, exposure in _list_exposures(self):
+                yield Shot(stage_mm=stage_mm, travelled_mm=stage_mm + error, light=light, exposure=exposure)
 
     def moves(self) -> bool:
         """Return whether the sensor moves during exposures."""
         return self.speed_mm_per_s > 0
 
+    def stage_speed_mm_s(self) -> float:
+        """Return the speed of the stage along its positions during an exposure."""
+        return self.speed_mm_per_s * (1 if self.step_mm >= 0 else -1)
+
     def images(self) -> int:
         """Return the number of images of the scan."""
-        laser = self.lights.count("laser")
-        return self.count * (len(self.lights) + laser * (len(self.bracket) - 1))
+        return self.count * len(_list_exposures(self))
+
+    def pose(self, shot: "Shot") -> np.ndarray:
+        """Return ``T_scene_object`` (4, 4) of the sensor's OCS at a shot, in the middle of its exposure."""
+        transform = np.eye(4)
+        transform[:3, 3] = shot.travelled_mm * self.unit_direction()
+        return transform
+
+    def twist(self, _shot: "Shot", *, exposure_s: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return velocity (3,) of the sensor in mm/s and rotation rate (3,) in rad/s, which is 0 on a stage."""
+        return self.stage_speed_mm_s() * self.unit_direction(), np.zeros(3)
 
 
 @dataclass(frozen=True)
@@ -100,6 +112,11 @@ class Shot:
     light: Light
     exposure: float = 1.0
     time_s: float | None = None
+
+
+def _list_exposures(motion: "Motion | Platform") -> list[tuple[Light, float]]:
+    """Return light and exposure factor of the images at each position."""
+    return [(light, each) for light in motion.lights for each in (motion.bracket if light == "laser" else (1.0,))]
 
 
 Poses = Callable[[np.ndarray], np.ndarray]  # poses (N, 4, 4) at times (N,) in s
@@ -128,14 +145,6 @@ class Course:
     def numbers(self) -> dict[Shot, int]:
         """Index of each shot."""
         return {shot: number for number, shot in enumerate(self.shots)}
-
-    def twist(self, shot: Shot, *, exposure_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mean velocity (3,) of the sensor in mm/s and its rotation rate (3,) in rad/s in an exposure."""
-        assert shot.time_s is not None
-        half = max(exposure_s / 2, 1e-4)
-        before, after = self.poses(shot.time_s + np.array([-half, half]))
-        turn = Rotation.from_matrix(after[:3, :3] @ before[:3, :3].T).as_rotvec()
-        return (after[:3, 3] - before[:3, 3]) / (2 * half), turn / (2 * half)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,14 +181,9 @@ class Platform(Description, ABC):
     states_covariance: bool = False
     errors_seed: Annotated[int, Field(ge=0)] = 0
 
-    def moves(self) -> bool:
-        """Return whether the sensor moves during exposures."""
-        return not self.stops
-
-    @property
     @abstractmethod
-    def stops(self) -> bool:
-        """True if the platform stops for each image."""
+    def moves(self) -> bool:
+        """Return whether the sensor moves during exposures; else the platform stops for each image."""
 
     @abstractmethod
     def places(self) -> int:
@@ -193,28 +197,40 @@ class Platform(Description, ABC):
     def _takes_images(self) -> "Platform":
         if not self.lights:
             raise ValueError("lights is empty: name 'lamp', 'laser' or both")
-        if self.stops and self.frame_rate_hz is not None:
+        if not self.moves() and self.frame_rate_hz is not None:
             raise ValueError(f"frame_rate_hz {self.frame_rate_hz:g} without a speed: give the speed, or omit the rate")
-        if not self.stops and self.frame_rate_hz is None:
+        if self.moves() and self.frame_rate_hz is None:
             raise ValueError("a moving platform needs frame_rate_hz")
-        if not self.stops and self.images_per_place() > 1:
+        if self.moves() and len(_list_exposures(self)) > 1:
             raise ValueError(
                 "a moving platform takes one image at a time: name one light and no bracket, or let it stop"
             )
         return self
 
-    def images_per_place(self) -> int:
-        """Return the number of images taken at every position."""
-        laser = self.lights.count("laser")
-        return len(self.lights) + laser * (len(self.bracket) - 1)
-
     def images(self) -> int:
         """Return the number of images of the scan."""
-        return self.places() * self.images_per_place()
+        return self.places() * len(_list_exposures(self))
 
     def shots(self) -> tuple[Shot, ...]:
         """Return all images of the scan in order."""
         return self.course().shots
+
+    def stage_speed_mm_s(self) -> float:
+        """Return the speed of a stage: 0, as a platform has none."""
+        return 0.0
+
+    def pose(self, shot: Shot) -> np.ndarray:
+        """Return ``T_scene_object`` (4, 4) of the sensor's OCS at a shot, in the middle of its exposure."""
+        assert shot.time_s is not None
+        return self.course().poses(np.array([shot.time_s]))[0]
+
+    def twist(self, shot: Shot, *, exposure_s: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mean velocity (3,) of the sensor in mm/s and its rotation rate (3,) in rad/s in an exposure."""
+        assert shot.time_s is not None
+        half = max(exposure_s / 2, 1e-4)
+        before, after = self.course().poses(shot.time_s + np.array([-half, half]))
+        turn = Rotation.from_matrix(after[:3, :3] @ before[:3, :3].T).as_rotvec()
+        return (after[:3, 3] - before[:3, 3]) / (2 * half), turn / (2 * half)
 
     def course(self) -> Course:
         """Return the path of the sensor, drawn with the platform's errors."""
@@ -225,15 +241,15 @@ class Platform(Description, ABC):
         rng = np.random.default_rng(self.errors_seed)
         motion, mount = self.draw_motion(rng), (self.true_mount or self.mount).matrix()
         period_s = self.stop_s if self.frame_rate_hz is None else 1 / self.frame_rate_hz
-        kinds: list[tuple[Light, float]]
-        kinds = [(light, each) for light in self.lights for each in (self.bracket if light == "laser" else (1.0,))]
+        kinds = _list_exposures(self)
         # Images at a stop are spread over its duration.
-        times = period_s / len(kinds) * (np.arange(self.images()) + (0.5 if self.stops else 0.0))
+        times = period_s / len(kinds) * (np.arange(self.images()) + (0.0 if self.moves() else 0.5))
 
         def sensor(at_s: np.ndarray) -> np.ndarray:
             return motion.true(at_s) @ mount
 
-        way = _path_lengths_mm(sensor(times))
+        steps = np.linalg.norm(np.diff(sensor(times)[:, :3, 3], axis=0), axis=1)
+        way = np.append(0.0, np.cumsum(steps))
         shots = tuple(
             Shot(stage_mm=0.0, travelled_mm=float(way[number]), light=light, exposure=exposure, time_s=float(time))
             for number, time in enumerate(times)
@@ -242,7 +258,7 @@ class Platform(Description, ABC):
         # Images are stored with the pose reported at the same reading of both clocks, despite their offset.
         reported, covariance = self._report_poses(motion, times - self.clock_offset_s, rng)
         report = None
-        if not self.stops:
+        if self.moves():
             own = np.arange(-LEAD_S, times[-1] + LEAD_S, 1 / self.report_hz)
             report = (own + self.clock_offset_s, *self._report_poses(motion, own, rng))
         return Course(shots, sensor, reported, covariance, report)
@@ -286,12 +302,11 @@ class Route(Platform):
             raise ValueError("speed_mm_per_s needs two waypoints or more; a trajectory has its own times")
         return self
 
-    @property
-    def stops(self) -> bool:
-        return self.trajectory is None and self.speed_mm_per_s == 0
+    def moves(self) -> bool:
+        return self.trajectory is not None or self.speed_mm_per_s > 0
 
     def places(self) -> int:
-        if self.stops:
+        if not self.moves():
             return len(self.waypoints)
         assert self.frame_rate_hz is not None
         return 1 + int(self._knots[0][-1] * self.frame_rate_hz + 1e-9)
@@ -304,7 +319,7 @@ class Route(Platform):
     def command_poses(self) -> Poses:
         """Return the nominal poses ``T_scene_platform`` of the path."""
         times, poses = self._knots
-        return _path(times, poses @ np.linalg.inv(self.mount.matrix()), stops=self.stops)
+        return _path(times, poses @ np.linalg.inv(self.mount.matrix()), stops=not self.moves())
 
 
 class IdealPath(Route):
@@ -324,7 +339,7 @@ def _knots(route: Route) -> tuple[np.ndarray, np.ndarray]:
         read = read_trajectory(route.trajectory, pose_format=route.trajectory_format, unit=route.trajectory_unit)
         return read.times_s - read.times_s[0], np.array(read.poses)
     poses = np.array([waypoint.matrix() for waypoint in route.waypoints])
-    if route.stops:
+    if not route.moves():
         return route.stop_s * np.arange(len(poses)), poses
     ways = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / route.speed_mm_per_s
     turns = Rotation.from_matrix(poses[1:, :3, :3] @ np.swapaxes(poses[:-1, :3, :3], 1, 2)).magnitude()
@@ -381,9 +396,3 @@ def interpolate_values(times: np.ndarray, values: np.ndarray, wanted: np.ndarray
 def find_stop(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Return the index of the stop at times."""
     return np.clip(np.searchsorted(times, np.asarray(wanted) + 1e-9, side="right") - 1, 0, len(times) - 1)
-
-
-def _path_lengths_mm(poses: np.ndarray) -> np.ndarray:
-    """Return the path length (N,) of the sensor's origin at each pose."""
-    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    return np.append(0.0, np.cumsum(steps))

@@ -147,7 +147,7 @@ Range = Annotated[tuple[Positive, Positive], AfterValidator(_check_range)]
 class FreeForm(SceneObject, ABC):
     """Base of free-form surfaces given by closed-form equations. They have no uv coordinates for a texture.
 
-    Each class is a module of `twin.scene.forms`, with its description, formula and triangles.
+    The classes are in `twin.scene.forms`.
     """
 
     _no_texture: ClassVar[str] = "on a surface without uv coordinates: leave it out, or use a mesh"

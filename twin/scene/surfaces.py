@@ -202,14 +202,9 @@ def lateral_spread(*, mean_free_path_mm: float, reflectance: float, index: float
     u from the reflectance. Weighted so, the mean path before the first scattering is l / (1 + u l cos(t)) at the angle
     t to the normal. The spread is that of normal incidence.
 
-    Parameters
-    ----------
-    mean_free_path_mm
-        Transport mean free path: 1 / (reduced scattering + absorption).
-    reflectance
-        Diffuse reflectance of the body: the fraction that is reflected if nothing is reflected inwards.
-    index
-        Refractive index of the body relative to the medium; 1 for a body without a smooth surface.
+    The transport mean free path is 1 / (reduced scattering + absorption). The diffuse ``reflectance`` of the body is
+    the fraction that is reflected if nothing is reflected inwards. ``index`` is the refractive index of the body
+    relative to the medium; 1 for a body without a smooth surface.
     """
     if mean_free_path_mm == 0 or reflectance == 0:
         return NO_SPREAD

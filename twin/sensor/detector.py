@@ -2,11 +2,8 @@
 
 Pixels of a camera differ from each other in the same way in every image (`fixed_pattern`). Charge above the full well
 of a pixel spills along its column (`spread_blooming`). Shot and read noise come from `twin.sensor.random_numbers`. The
-peak finder of a 3D camera reduces an image to one number per profile line.
-
-Flaws of real recordings (`twin.rendering_options.Flaws`): some are properties of the sensor (`as_built`). Others change
-the light on the image sensor (`vignette`, `add_glare`, `laser_shares`) or the grey values that the camera delivers
-(`deliver_image`).
+peak finder of a 3D camera reduces an image to one number per profile line. The rest are flaws of real recordings
+(`twin.rendering_options.Flaws`).
 """
 
 from __future__ import annotations
@@ -53,42 +50,18 @@ def grey_values(
     rng: np.random.Generator | None,
     pattern: FixedPattern | None = None,
 ) -> np.ndarray:
-    """Return the image (H, W), uint8 or uint16, for mean photo-electrons.
+    """Return the image (H, W), uint8 or uint16, for mean photo-electrons (H, W) and their exposure time.
 
     Signal and dark current have Poisson shot noise. Blooming and full well are applied before the read-out, which adds
     offset pattern and noise; the only quantisation is the final rounding. Bands of rows have independent random
-    numbers, so that the image does not depend on the number of parallel tasks.
-
-    Parameters
-    ----------
-    electrons : (H, W)
-        Mean number of photo-electrons per pixel.
-    detector
-        Full well, noise, offset, gain and bits.
-    exposure_ms
-        Exposure time, for the dark current.
-    rng
-        Source of temporal noise; None: no noise.
-    pattern
-        Fixed-pattern noise of the detector; None: none.
-
-    Raises
-    ------
-    ImageError
-        ``electrons`` is not a two-dimensional image of finite numbers from 0 to 1e15, or ``pattern`` has another size.
+    numbers, so that the image does not depend on the number of parallel tasks. Without ``rng`` there is no temporal
+    noise, without ``pattern`` no fixed one. ImageError if the electrons are not finite numbers from 0 to 1e15.
     """
     electrons = np.asarray(electrons, np.float32)
-    if electrons.ndim != 2 or electrons.size == 0:
-        raise ImageError(f"mean electrons have the shape {electrons.shape}; expected an image (H, W)")
     least, most = electrons.min(), electrons.max()
     if not (least >= 0 and most <= MOST_ELECTRONS):
         raise ImageError(
             f"mean electrons run from {least:g} to {most:g}; expected finite numbers from 0 to {MOST_ELECTRONS:g}"
-        )
-    if pattern is not None and pattern.gain.shape != electrons.shape:
-        raise ImageError(
-            f"the fixed pattern is of {pattern.gain.shape} pixels, the image of {electrons.shape}: create the pattern "
-            "with the height and width of the image"
         )
     count = min(_BANDS, len(electrons))
     detectors, exposures = [detector] * count, [exposure_ms] * count

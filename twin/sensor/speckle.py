@@ -25,7 +25,7 @@ from scipy import fft, ndimage, special
 from scipy.special import j1
 
 from twin.sensor.random_numbers import add_normal_numbers
-from uwlts.errors import DesignError, ImageError, RangeError
+from uwlts.errors import DesignError
 from uwlts.model.sensor import Camera
 
 # Period of the pattern across the stripe: at least this many pixels, wider than a stripe, and this many grains.
@@ -64,7 +64,7 @@ class Speckle:
     A pattern depends only on seed, travel and pixel: frames, or parts of a frame, can be computed in any order. After
     ``2 renewal_mm`` of travel it is independent. ``wavelength_nm`` is that in air, between lens and image sensor.
     Different non-negative seeds give independent patterns. DesignError if the lens is focused within its focal length,
-    or grains are wider than 64 pixels; RangeError if the wavelength is not finite, or below 1 nm.
+    or grains are wider than 64 pixels.
     """
 
     def __init__(self, camera: Camera, *, wavelength_nm: float, seed: int) -> None:
@@ -74,7 +74,7 @@ class Speckle:
                 f"focus_distance_mm {focus:g} is not larger than focal_length_mm {focal:g}: the lens forms no image"
             )
         magnification = focal / (focus - focal)  # of the focused plane
-        wavelength_mm = 1e-6 * float(_require_range("the wavelength in nm", wavelength_nm, 1.0, math.inf))
+        wavelength_mm = 1e-6 * wavelength_nm
         grain_mm = wavelength_mm * camera.f_number * (1 + magnification)
         grain_px = grain_mm / (1e-3 * camera.pixel_size_um)
         if grain_px > _WIDEST_PX:
@@ -98,99 +98,50 @@ class Speckle:
         polarisation: ArrayLike,
         coherence: ArrayLike = 1.0,
     ) -> np.ndarray:
-        """Return factors (P,), float32, not negative and of mean 1, of the laser's light in pixels (P,).
+        """Return factors (P,), float32, not negative and of mean 1, of the laser's light in pixels (P,) in any order.
 
-        Parameters
-        ----------
-        rows, columns
-            Pixels (P,) in any order.
-        travel_mm
-            Travel of the stage. See `renewal_correlation` for its effect.
-        polarisation
-            Degree of polarisation P of the scattered light, (P,) or a scalar, 0 to 1: 1 for bare metal, about 0 for
-            paint and plastics, where light is scattered many times. The patterns of two orthogonal polarisations add in
-            intensity, I = (1 + P) / 2 I_1 + (1 - P) / 2 I_2, with the contrast sqrt((1 + P^2) / 2) (Goodman, Speckle
-            Phenomena in Optics, Ch. 3).
-        coherence
-            Contrast of the unintegrated pattern of one polarisation, (P,) or a scalar, 1e-4 to 1 (smaller values are
-            raised); see the function `coherence`. It multiplies the contrast, as averaging over the pixel area does
-            (`pixel_contrast`).
+        ``travel_mm`` is the travel of the stage; see `renewal_correlation` for its effect. ``polarisation`` is the
+        degree of polarisation P of the scattered light, (P,) or a scalar, 0 to 1: 1 for bare metal, about 0 for paint
+        and plastics, where light is scattered many times. The patterns of two orthogonal polarisations add in
+        intensity, I = (1 + P) / 2 I_1 + (1 - P) / 2 I_2, with the contrast sqrt((1 + P^2) / 2) (Goodman, Speckle
+        Phenomena in Optics, Ch. 3). ``coherence`` is the contrast of the unintegrated pattern of one polarisation, (P,)
+        or a scalar, 1e-4 to 1 (smaller values are raised); see the function `coherence`. It multiplies the contrast, as
+        averaging over the pixel area does (`pixel_contrast`).
 
-        Raises
-        ------
-        ImageError
-            A pixel is outside the image.
-        RangeError
-            Travel, polarisation or coherence is not finite or outside its range.
-
-        Notes
-        -----
         All factors have the same grains. If many patterns add up, the true correlation between pixels is smaller by
         up to a fifth.
         """
         # Small integer types would overflow in the index of a pixel in the tile.
         rows, columns = (np.asarray(values).astype(np.intp, casting="same_kind") for values in (rows, columns))
-        height, width = self.camera.height_px, self.camera.width_px
-        inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
-        if not inside.all():
-            worst = np.argmin(inside)
-            raise ImageError(
-                f"row {rows[worst]}, column {columns[worst]} is outside the image of {height} rows and {width} columns"
-            )
-        position = float(_require_range("the travel in mm", travel_mm, -math.inf, math.inf)) / self.renewal_mm
-        polarised = np.square(_require_range("the degree of polarisation", polarisation, 0.0, 1.0))
-        coherent = np.square(np.maximum(_require_range("the coherence", coherence, 0.0, 1.0), _LEAST_CONTRAST))
+        polarised = np.square(np.asarray(polarisation, float))
+        coherent = np.square(np.maximum(np.asarray(coherence, float), _LEAST_CONTRAST))
         squares, cubes = self._pixel
         # A Gaussian line (`coherence`) has weights proportional to r^k, with C^2 = (1 - r) / (1 + r).
         variance = squares * coherent * (1 + polarised) / 2
         cubes = cubes * 4 * np.square(coherent) / (3 + np.square(coherent)) * (1 + 3 * polarised) / 4
         along, across = (columns, rows) if self._along_width else (rows, columns)
-        pattern = self._tile.intensity(_amplitudes(self._tile.size, self._seed, position))
+        pattern = self._tile.intensity(_amplitudes(self._tile.size, self._seed, travel_mm / self.renewal_mm))
         intensity = pattern[across % self._tile.across_px, along]
         factors = 1 + np.sqrt(variance) * _skew_exponential(intensity, cubes / variance**1.5)
         return np.maximum(factors, 0.0).astype(np.float32)
 
 
-def coherence(
-    roughness_um: ArrayLike,
-    *,
-    linewidth_nm: float,
-    wavelength_nm: float,
-    index: float = 1.0,
-    cosines: tuple[float, float] = (1.0, 1.0),
-) -> np.ndarray:
+def coherence(roughness_um: ArrayLike, *, linewidth_nm: float, wavelength_nm: float, index: float = 1.0) -> np.ndarray:
     """Return the speckle contrast, above 0 up to 1, of a rough surface in laser light of a spectral width.
 
-    A height h delays the light by n (cos i + cos o) h = g h. Let heights be normally distributed with the standard
-    deviation s. Patterns of wavenumbers that differ by q then have an amplitude correlation of exp(-(q g s)^2 / 2), and
-    an intensity correlation of exp(-(q g s)^2). Over a Gaussian line of standard deviation d, q has the variance 2 d^2.
-    The mean intensity correlation is C^2 = (1 + 4 (d g s)^2)^(-1/2) (Parry in Dainty, Laser Speckle and Related
-    Phenomena, 1975; Goodman, Speckle Phenomena in Optics, Ch. 5).
+    A height h delays light that arrives and leaves along the normal by 2 n h = g h. Let heights be normally
+    distributed with the standard deviation s. Patterns of wavenumbers that differ by q then have an amplitude
+    correlation of exp(-(q g s)^2 / 2), and an intensity correlation of exp(-(q g s)^2). Over a Gaussian line of
+    standard deviation d, q has the variance 2 d^2. The mean intensity correlation is C^2 = (1 + 4 (d g s)^2)^(-1/2)
+    (Parry in Dainty, Laser Speckle and Related Phenomena, 1975; Goodman, Speckle Phenomena in Optics, Ch. 5).
 
-    Parameters
-    ----------
-    roughness_um
-        Standard deviation of the surface's heights within a resolution cell, of any shape. If light enters the
-        material, give half the standard deviation of its optical path instead, with the index 1.
-    linewidth_nm
-        Full width at half maximum of the laser's spectrum during an exposure, 0 for a coherent laser.
-    wavelength_nm
-        Mean wavelength in air.
-    index
-        Refractive index n of the medium relative to air.
-    cosines
-        Cosines of the angles i and o of incident and scattered light with the surface normal.
-
-    Raises
-    ------
-    RangeError
-        A value is not finite, or negative.
+    ``roughness_um``, of any shape, is the standard deviation of the surface's heights within a resolution cell. If
+    light enters the material, give half the standard deviation of its optical path instead, with the index 1.
+    ``linewidth_nm`` is the full width at half maximum of the laser's spectrum during an exposure, 0 for a coherent
+    laser. ``wavelength_nm`` is the mean one in air, ``index`` the refractive index n of the medium relative to air.
     """
-    roughness = _require_range("the roughness in um", roughness_um, 0.0, math.inf)
-    width = _require_range("the line width in nm", linewidth_nm, 0.0, math.inf)
-    wavelength = _require_range("the wavelength in nm", wavelength_nm, 1.0, math.inf)
-    spread_per_um = 1e3 * 2 * math.pi / wavelength**2 * width / math.sqrt(8 * math.log(2))
-    return (1 + 4 * (spread_per_um * index * sum(cosines) * roughness) ** 2) ** -0.25
+    spread_per_um = 1e3 * 2 * math.pi / wavelength_nm**2 * linewidth_nm / math.sqrt(8 * math.log(2))
+    return (1 + 4 * (spread_per_um * index * 2 * np.asarray(roughness_um, float)) ** 2) ** -0.25
 
 
 def pixel_contrast(grain_px: float) -> float:
@@ -360,12 +311,3 @@ def _draw(size: int, seed: int, group: int, node: int) -> np.ndarray:
     parts = np.zeros(2 * size, np.float32)
     add_normal_numbers(parts, math.sqrt(0.5), rng)
     return parts.view(np.complex64)
-
-
-def _require_range(name: str, value: ArrayLike, least: float, most: float) -> np.ndarray:
-    """Return the value as float64; RangeError if it is not finite or outside the range."""
-    value = np.asarray(value, float)
-    bad = ~(np.isfinite(value) & (value >= least) & (value <= most))
-    if bad.any():
-        raise RangeError(f"{name} is {value[bad].flat[0]:g}; it must be finite and from {least:g} to {most:g}")
-    return value

@@ -10,7 +10,7 @@ from twin.datasets.data_set import FAINT_BELOW, LineStatus, Mask
 from twin.datasets.labels import make_labels, noise_std_e, stripe_quality
 from twin.recording.sensor_simulator import SensorSimulator, SimulatedImage
 from twin.rendering_options import Effects, Options
-from twin.scene.forms.flawed_parts import PittedPipe, pitted_radius
+from twin.scene.forms.parts import PittedPipe, pitted_radius
 from twin.scene.platforms import Motion, Shot
 from uwlts.model.sensor import Sensor
 

@@ -17,7 +17,7 @@ from twin.experiments.detection import (
 )
 from twin.scene.campaign import Take
 from twin.scene.forms import PittedPipe, Weld
-from twin.scene.forms.flawed_parts import pit_depths, pit_places, undercut_depths
+from twin.scene.forms.parts import pit_depths, pit_places, undercut_depths
 from uwlts.errors import CaptureError
 
 PIPE = {"kind": "pitted_pipe", "pits": 12, "pit_diameter_mm": 6.0, "pit_depth_mm": (0.02, 0.4), "pit_gap_mm": 3.0}

@@ -55,7 +55,7 @@ def test_a_window_passes_what_the_fields_continuity_allows(mode, glass, absorpti
         rotation=np.eye(3),
     )
     angle = np.radians(np.linspace(0, 75, 151))
-    direction = mi.Vector3f(to_jit(mi.Float, np.sin(angle)), 0.0, to_jit(mi.Float, np.cos(angle)))
+    direction = mi.Vector3f(to_jit(np.sin(angle)), 0.0, to_jit(np.cos(angle)))
     transport = {"camera": mi.TransportMode.Radiance, "laser": mi.TransportMode.Importance}[mode]
     path = faces.trace(mi.Point3f(0.0, 0.0, 0.0), direction, mode=transport)
     assert (path.weight.numpy() > 0).all()
@@ -84,7 +84,7 @@ def profile(
     y, weights = gauss_legendre(-edge * (1 - 1e-6), edge * (1 - 1e-6), 80)
     x = np.linspace(-3.0, 3.0, 301)
     grid_x, grid_y = np.meshgrid(x, y, indexing="ij")
-    p = mi.Point3f(to_jit(mi.Float, grid_x), to_jit(mi.Float, grid_y), mi.Float(z))
+    p = mi.Point3f(to_jit(grid_x), to_jit(grid_y), mi.Float(z))
     light = sheet.evaluate(p)
     power = light.irradiance * light.direction.z
     dr.eval(power)
@@ -179,7 +179,7 @@ def stripe_sum(sensor: Sensor, medium: Medium, y: np.ndarray, z: float, *, refle
 def test_the_stripes_irradiance_is_what_power_reflectance_and_lens_make_of_it(thesis):
     sensor, medium, reflectance = cropped(thesis, 1280, 160), clear(0.3), 0.37
     renderer = Renderer(sensor, medium, scene_of(plate(reflectance=reflectance)), effects=NONE)
-    column_sums = renderer.irradiance("laser", sensor_at(), spp=64).astype(float).sum(axis=0)
+    column_sums = renderer.laser_frame(sensor_at(), spp=64).irradiance().astype(float).sum(axis=0)
     y = np.linspace(-60.0, 60.0, 13)
     centre = image_of(sensor, medium, np.stack([0 * y, y, 0 * y], axis=1))[:, 0]
     columns = np.rint(centre).astype(int)[:, None] + np.arange(-20, 21)
@@ -202,7 +202,7 @@ def test_water_dims_the_stripe_over_the_laser_s_and_the_cameras_way(thesis, abso
     media = clear(), clear(absorption, scattering, phase="henyey-greenstein", asymmetry=0.95)
     renderers = [Renderer(sensor, medium, scene_of(plate()), effects=NONE) for medium in media]
     for z in (-40.0, 0.0, 50.0):
-        bright, dim = (r.irradiance("laser", sensor_at(-z), spp=64).astype(float) for r in renderers)
+        bright, dim = (r.laser_frame(sensor_at(-z), spp=64).irradiance().astype(float) for r in renderers)
         lit = bright.sum(axis=1) > 0.01 * bright.sum(axis=1).max()
         found = dim[lit].sum() / bright[lit].sum()
         laser_way = oracle_fan(sensor, media[0]).way_in_medium(0.0, z - laser_origin(sensor)[2])
@@ -232,17 +232,16 @@ def test_a_retroreflecting_mark_returns_lamp_light_only(thesis):
     sensor = altered(thesis, {"lamp": {"irradiance_w_per_m2": 3.0, "ambient_w_per_m2": 2.0}})
     sensor = altered(sensor, {"camera": {"width_px": 64, "height_px": 48}})
     plain, tape = plate(reflectance=0.2), plate(reflectance=0.2) | {"retroreflection": 1.5}
-    images = {
-        (name, light): Renderer(sensor, clear(), scene_of(thing), effects=replace(NONE, ambient=True)).irradiance(
-            light, sensor_at(), spp=4
-        )
-        for name, thing in (("plain", plain), ("tape", tape))
-        for light in ("lamp", "day", "laser")
-    }
+    effects = replace(NONE, ambient=True)
+    marks = [Renderer(sensor, clear(), scene_of(thing), effects=effects) for thing in (plain, tape)]
+    (lamp, with_lamp), (day, with_day) = (
+        [mark.irradiance(light, sensor_at(), spp=4) for mark in marks] for light in ("lamp", "day")
+    )
     # The radiance of a diffuse surface is reflectance E / pi, that of the tape 1.5 E more.
-    np.testing.assert_allclose(images["tape", "lamp"] / images["plain", "lamp"], 1 + 1.5 * math.pi / 0.2, rtol=1e-4)
-    for light in ("day", "laser"):
-        np.testing.assert_array_equal(images["tape", light], images["plain", light])
+    np.testing.assert_allclose(with_lamp / lamp, 1 + 1.5 * math.pi / 0.2, rtol=1e-4)
+    np.testing.assert_array_equal(with_day, day)
+    laser, with_laser = (mark.laser_frame(sensor_at(), spp=4).irradiance() for mark in marks)
+    np.testing.assert_array_equal(with_laser, laser)
 
 
 @pytest.mark.parametrize("light", ["day", "lamp"])

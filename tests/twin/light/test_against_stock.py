@@ -59,7 +59,7 @@ def twin_irradiance(
 ) -> np.ndarray:
     """Return block means (runs, H, W) of the twin's image in W/mm2, without defocus like the stock pinhole."""
     renderer = Renderer(sensor, medium, scene, effects=ALL.remove("defocus", *without))
-    images = (renderer.irradiance("laser", sensor_at(), spp=spp, seed=run) for run in range(runs))
+    images = (renderer.laser_frame(sensor_at(), spp=spp, seed=run).irradiance() for run in range(runs))
     return np.stack([blocks(image, pixel_px) for image in images])
 
 

@@ -121,9 +121,9 @@ def sensor(thesis: Sensor) -> Sensor:
 
 
 def test_images_show_the_pattern_on_surfaces_by_day_alone(sensor):
-    surface, scene = water_surface(depth_mm=300.0), scene_of(plate(side=400.0))
+    surface, scene = water_surface(depth_mm=300.0), scene_of(plate(side=400.0), depth_m=0.3)
     day = replace(NONE, ambient=True)
-    even, focused = (Renderer(sensor, clear(), scene, effects=day, caustics=waves) for waves in (None, surface))
+    even, focused = (Renderer(sensor, clear(), scene, effects=day, flaws=Flaws(caustics=wind)) for wind in (0.0, 2.0))
     plain, seen = (each.irradiance("day", sensor_at(), spp=4) for each in (even, focused))
     inside = plain > 0.5 * plain.max()
     assert inside.mean() > 0.5
@@ -151,9 +151,9 @@ def test_a_scan_takes_its_waves_from_wind_depth_and_time(sensor):
     water["scattering_per_mm"] = windy.medium.scattering_per_mm(635.0)
     surface = water_surface(depth_mm=300.0, seed=5, **water)
     lit = plain > 0.5 * plain.max()
-    expected = Renderer(sensor, windy.medium, scene, effects=effects, caustics=surface).irradiance(
-        "day", windy.pose(shots[0]), spp=16, exposure_s=5e-3
-    )
+    renderer = Renderer(sensor, windy.medium, scene, effects=effects)
+    renderer._caustics = surface
+    expected = renderer.irradiance("day", windy.pose(shots[0]), spp=16, exposure_s=5e-3)
     np.testing.assert_allclose(first, expected, rtol=1e-5)
     assert first[lit].std() > 0.1 * first[lit].mean() > plain[lit].std()
     assert np.corrcoef(first[lit], second[lit])[0, 1] < 0.5

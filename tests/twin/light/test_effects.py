@@ -65,7 +65,7 @@ def test_each_effect_can_be_left_out(sensor, name):
 
 def test_walks_depend_on_the_seed_only(sensor):
     renderer = Renderer(sensor, sensor.media["water"], groove(), effects=ALL)
-    one, again, other = (renderer.irradiance("laser", sensor_at(), spp=8, seed=seed) for seed in (1, 1, 2))
+    one, again, other = (renderer.laser_frame(sensor_at(), spp=8, seed=seed).irradiance() for seed in (1, 1, 2))
     np.testing.assert_array_equal(one, again)
     assert (one != other).mean() > 0.3
 

@@ -91,7 +91,7 @@ def opencv_pixels(camera: Camera, rays: np.ndarray) -> np.ndarray:
 def hits(renderer: Renderer, pixels: np.ndarray, z: float) -> np.ndarray:
     """Return the points (N, 3) in the OCS where image points see the plate at ``z``, by Mitsuba."""
     pose = SensorPose(sensor_at(-z))
-    bundle = renderer.view.trace_bundle(to_jit(mi.Float, pixels[:, 0]), to_jit(mi.Float, pixels[:, 1]))
+    bundle = renderer.view.trace_bundle(to_jit(pixels[:, 0]), to_jit(pixels[:, 1]))
     si = renderer.objects.scene.ray_intersect(pose.ray(bundle.origin, bundle.direction))
     seen = si.is_valid() & (bundle.weight > 0)
     dr.eval(si.p, seen)
@@ -153,7 +153,7 @@ def test_a_slightly_wrong_window_would_be_noticed(thesis):
 def test_the_lens_inverts_opencvs_distortion(thesis, distortion):
     camera = altered(thesis, {"camera": {"distortion": distortion, "principal_point_px": (633.3, 517.7)}}).camera
     pixels = image_points(camera)
-    lens = LensRays(camera).directions(to_jit(mi.Float, pixels[:, 0]), to_jit(mi.Float, pixels[:, 1]))
+    lens = LensRays(camera).directions(to_jit(pixels[:, 0]), to_jit(pixels[:, 1]))
     rays = to_numpy(lens).astype(float)
     # 32 bits: a pixel near 1279 is known to 6e-5 px, and some ten roundings of 6e-8 at the focal length of 2358 px
     # add up to 5e-4 px.
@@ -169,7 +169,7 @@ def test_a_wide_equidistant_lens_is_followed_to_its_corners(thesis):
     size_um = thesis.camera.pixel_size_um
     changes = {"distortion": distortion, "focal_length_mm": 1e-3 * focal * size_um, "principal_point_px": centre}
     camera, pixels = altered(thesis, {"camera": changes}).camera, image_points(thesis.camera)
-    rays = to_numpy(LensRays(camera).directions(to_jit(mi.Float, pixels[:, 0]), to_jit(mi.Float, pixels[:, 1])))
+    rays = to_numpy(LensRays(camera).directions(to_jit(pixels[:, 0]), to_jit(pixels[:, 1])))
     # 0.02 px by the conversion, of 720 px.
     np.testing.assert_allclose(rays, equidistant(focal, centre)(pixels), rtol=0, atol=3e-5)
 
@@ -194,7 +194,7 @@ def window_of(**changes: object) -> Window:
 def sent_through(window: Window, medium: Medium, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rays at angles to the axis in the x-z plane: origins, directions (N, 3) behind the window, and which passed."""
     faces = WindowFaces(window, medium, wavelength_nm=635.0, origin_mm=np.zeros(3), rotation=np.eye(3))
-    x, z = to_jit(mi.Float, np.sin(angles)), to_jit(mi.Float, np.cos(angles))
+    x, z = to_jit(np.sin(angles)), to_jit(np.cos(angles))
     path = faces.trace(mi.Point3f(0.0, 0.0, 0.0), mi.Vector3f(x, 0.0, z), mode=mi.TransportMode.Radiance)
     return to_numpy(path.origin), to_numpy(path.direction), path.weight.numpy() > 0
 
@@ -247,7 +247,7 @@ def sheet_points(sensor: Sensor, medium: Medium, angle: np.ndarray, z: float) ->
 
 def light_at(sheet: Sheet, points: np.ndarray) -> dict[str, np.ndarray]:
     """Return the light of the sheet at points (N, 3) as NumPy arrays."""
-    light = sheet.evaluate(mi.Point3f(*[to_jit(mi.Float, column) for column in points.T]))
+    light = sheet.evaluate(mi.Point3f(*[to_jit(column) for column in points.T]))
     dr.eval(light)
     values = {
         name: getattr(light, name).numpy().astype(float)

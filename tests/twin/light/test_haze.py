@@ -31,8 +31,6 @@ from twin.light.water import Scattering
 from twin.rendering_options import NONE
 from uwlts.model.sensor import Medium, Sensor
 
-import mitsuba as mi  # isort: skip
-
 TURBID = {
     "molecular": clear(0.3, 1.0),
     "forward": clear(0.5, 2.0, phase="henyey-greenstein", asymmetry=0.9),
@@ -64,7 +62,7 @@ def scattered_per_sr(medium: Medium, cosine: np.ndarray) -> np.ndarray:
 def test_phase_functions_scatter_everything_once(name):
     medium = TURBID[name]
     nodes, weights = gauss_legendre(-1, 1, 100)
-    value = Scattering(medium, 635.0).phase(to_jit(mi.Float, 1 - nodes)).numpy().astype(float)
+    value = Scattering(medium, 635.0).phase(to_jit(1 - nodes)).numpy().astype(float)
     # The table's logarithm is linear over steps of 0.0088 of a function whose second derivative is below 0.5: 5e-6.
     # 32 bits leave 1e-6 of the logarithm and, at g = -0.4 backwards, 1e-5 of 1 + cos.
     assert 2 * math.pi * weights @ value == pytest.approx(1.0, abs=2e-5)
@@ -132,7 +130,7 @@ def coarse(thesis: Sensor) -> Sensor:
 @pytest.mark.parametrize("name", TURBID)
 def test_haze_is_the_scattering_integral_along_camera_rays(thesis, name):
     sensor, medium = coarse(thesis), TURBID[name]
-    image = Renderer(sensor, medium, scene_of(FAR_AWAY), effects=ONCE).irradiance("laser", sensor_at(), spp=1)
+    image = Renderer(sensor, medium, scene_of(FAR_AWAY), effects=ONCE).laser_frame(sensor_at(), spp=1).irradiance()
     columns, rows = (g.ravel() for g in np.meshgrid(np.arange(25, 140, 19), np.arange(2, 126, 17)))
     cells = np.stack([columns, rows], axis=1)
     found = image[NODE_SPACING_PX * rows, NODE_SPACING_PX * columns]
@@ -146,9 +144,11 @@ def test_haze_is_the_scattering_integral_along_camera_rays(thesis, name):
 
 def test_haze_ends_at_a_surface(thesis):
     sensor, medium = cropped(thesis, 32, 64), TURBID["molecular"]
-    free = Renderer(sensor, medium, scene_of(FAR_AWAY), effects=ONCE).irradiance("laser", sensor_at(), spp=1)
-    cut = Renderer(sensor, medium, scene_of(plate(reflectance=0.0)), effects=ONCE).irradiance(
-        "laser", sensor_at(), spp=1
+    free = Renderer(sensor, medium, scene_of(FAR_AWAY), effects=ONCE).laser_frame(sensor_at(), spp=1).irradiance()
+    cut = (
+        Renderer(sensor, medium, scene_of(plate(reflectance=0.0)), effects=ONCE)
+        .laser_frame(sensor_at(), spp=1)
+        .irradiance()
     )
     rows = np.arange(64 // NODE_SPACING_PX)
     cells = np.stack([np.full_like(rows, 8), rows], axis=1)
@@ -167,7 +167,7 @@ def test_there_is_no_haze_in_an_objects_shadow(thesis, pose):
     sensor, medium = coarse(thesis), TURBID["molecular"]
     position = pose[:3, 3] + [0.0, 10.0, -30.0]
     free, shadowed = (
-        Renderer(sensor, medium, scene_of(thing), effects=ONCE).irradiance("laser", pose, spp=1)
+        Renderer(sensor, medium, scene_of(thing), effects=ONCE).laser_frame(pose, spp=1).irradiance()
         for thing in (FAR_AWAY, block((6.0, 40.0, 10.0), tuple(position)))
     )
     _, origins, directions = camera_rays(sensor, medium, nodes_about(np.array([(80, row) for row in range(128)])))

@@ -51,7 +51,7 @@ def test_a_laser_scan_compiles_nothing_after_its_first_frame(thesis, new_kernels
     new_kernels()
 
     def frame(index: int, pose: np.ndarray) -> int:
-        image = renderer.irradiance("laser", pose, spp=4 + index % 2)
+        image = renderer.laser_frame(pose, spp=4 + index % 2).irradiance()
         find_true_stripe(renderer, pose)
         return len(renderer.lit_pixels(SensorPose(pose))[0]) + 0 * len(image)
 
@@ -63,7 +63,7 @@ def test_a_laser_scan_compiles_nothing_after_its_first_frame(thesis, new_kernels
     launched, new = new_kernels()
     assert launched > 100
     assert new == 0
-    assert renderer.irradiance("laser", sensor_at(x=500.0), spp=4).max() >= 0, "a frame with nothing in view"
+    assert renderer.laser_frame(sensor_at(x=500.0), spp=4).irradiance().max() >= 0, "a frame with nothing in view"
     assert new_kernels()[1] == 0
 
 
@@ -102,8 +102,8 @@ OTHER = {
 def test_another_sensor_in_other_water_compiles_nothing(thesis, new_kernels):
     def frames(sensor: Sensor, medium: Medium, thing: dict[str, object], *, spp: int) -> None:
         renderer = Renderer(sensor, medium, scene_of(thing, plate(60.0, side=150.0, x=40.0)))
-        for light in ("laser", "lamp"):
-            renderer.irradiance(light, sensor_at(x=0.5), spp=spp)
+        renderer.laser_frame(sensor_at(x=0.5), spp=spp).irradiance()
+        renderer.irradiance("lamp", sensor_at(x=0.5), spp=spp)
 
     frames(altered(thesis, SMALL), clear(0.3, 0.5), sphere(), spp=4)
     assert new_kernels()[1] >= 4
@@ -120,8 +120,8 @@ def test_another_texture_and_translucency_compile_nothing(thesis, new_kernels):
     def frames(changes: dict[str, object], *, seed: int) -> None:
         grown = sphere() | {"finish": "fouled-steel"} | changes
         pipe = plate(60.0, side=150.0, x=40.0) | {"reflectance": 0.6, "finish": "pvc-pipe"}
-        renderer = Renderer(altered(thesis, SMALL), clear(0.3), scene_of(grown, pipe), surface_seed=seed)
-        renderer.irradiance("laser", sensor_at(x=0.5), spp=4)
+        renderer = Renderer(altered(thesis, SMALL), clear(0.3), scene_of(grown, pipe), seed=seed)
+        renderer.laser_frame(sensor_at(x=0.5), spp=4).irradiance()
 
     frames({}, seed=1)
     assert new_kernels()[1] >= 4

@@ -20,7 +20,9 @@ AIR = Medium(kind="air")
 
 def columns(sensor: Sensor, medium: Medium, z: float, effects=BLURRED) -> np.ndarray:
     """Column profiles (H, W) of the stripe on a plate at ``z``."""
-    image = Renderer(sensor, medium, scene_of(plate()), effects=effects).irradiance("laser", sensor_at(-z), spp=SPP)
+    image = (
+        Renderer(sensor, medium, scene_of(plate()), effects=effects).laser_frame(sensor_at(-z), spp=SPP).irradiance()
+    )
     return image.astype(float)
 
 
@@ -119,7 +121,7 @@ def test_a_tilted_window_shifts_the_blurred_stripe_from_its_chief_rays(thesis):
     offsets = []
     for effects in (NONE, BLURRED):
         renderer = Renderer(sensor, medium, scene_of(plate()), effects=effects)
-        image = renderer.irradiance("laser", sensor_at(), spp=SPP).astype(float)
+        image = renderer.laser_frame(sensor_at(), spp=SPP).irradiance().astype(float)
         truth = find_true_stripe(renderer, sensor_at())
         offsets.append(np.mean((row * image).sum(axis=0) / image.sum(axis=0) - truth.centre_px))
     assert abs(offsets[0]) < 3e-3

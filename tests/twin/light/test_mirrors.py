@@ -30,7 +30,7 @@ def mirror(share: float, **rest: object) -> dict[str, object]:
 
 def test_a_perfect_mirror_shows_no_stripe_of_its_own(thesis):
     renderer = Renderer(thesis, clear(), scene_of(mirror(1.0)), effects=EFFECTS)
-    assert renderer.irradiance("laser", sensor_at(), spp=16).max() == 0
+    assert renderer.laser_frame(sensor_at(), spp=16).irradiance().max() == 0
     assert (find_true_stripe(renderer, sensor_at()).status != TruthStatus.VISIBLE).all()
 
 
@@ -45,7 +45,7 @@ def hidden(share: float) -> Scene:
 
 
 def brightness(thesis: Sensor, share: float) -> np.ndarray:
-    return Renderer(thesis, clear(), hidden(share), effects=EFFECTS).irradiance("laser", sensor_at(), spp=64)
+    return Renderer(thesis, clear(), hidden(share), effects=EFFECTS).laser_frame(sensor_at(), spp=64).irradiance()
 
 
 def test_a_stripe_lit_and_seen_by_way_of_a_mirror_shows_at_its_mirrored_points(thesis):
@@ -86,8 +86,8 @@ def test_while_the_sensor_travels_the_light_by_way_of_a_mirror_travels_as_well(t
     """The exposure is the mean of still images at positions along the path, the outermost with half the weight."""
     renderer = Renderer(thesis, clear(), hidden(SHARE), effects=replace(EFFECTS, motion=True))
     way = Travel(velocity_mm_s=np.array([100.0, 0.0, 0.0]), exposure_s=0.04)
-    moving = renderer.irradiance("laser", sensor_at(), spp=64, travel=way).astype(float)
-    still = [renderer.irradiance("laser", sensor_at(x=x), spp=64).astype(float) for x in np.linspace(-2.0, 2.0, 9)]
+    moving = renderer.laser_frame(sensor_at(), spp=64, travel=way).irradiance().astype(float)
+    still = [renderer.laser_frame(sensor_at(x=x), spp=64).irradiance().astype(float) for x in np.linspace(-2.0, 2.0, 9)]
     mean = np.average(still, axis=0, weights=[0.5, *[1.0] * 7, 0.5])
     assert moving.sum() == pytest.approx(mean.sum(), rel=2e-3)
     rows = np.arange(len(mean))
@@ -101,7 +101,7 @@ def test_while_the_sensor_travels_the_light_by_way_of_a_mirror_travels_as_well(t
 def test_the_straight_stripe_is_the_same_with_a_mirror(thesis):
     scenes = [scene_of(BLOCK, mirror(share)) for share in (SHARE, 0.0)]
     renderers = [Renderer(thesis, clear(), scene, effects=EFFECTS) for scene in scenes]
-    with_mirror, without = (renderer.irradiance("laser", sensor_at(), spp=64) for renderer in renderers)
+    with_mirror, without = (renderer.laser_frame(sensor_at(), spp=64).irradiance() for renderer in renderers)
     truth = find_true_stripe(renderers[1], sensor_at())
     line = np.flatnonzero(truth.status == TruthStatus.VISIBLE)[20:-20]
     row = np.rint(truth.centre_px[line]).astype(int)

@@ -40,8 +40,8 @@ def test_travel_during_the_exposure_blurs_the_stripe_evenly(renderer, exposure_m
     centres = [find_true_stripe(renderer, sensor_at(x=x)).centre_px for x in (-1.0, 1.0)]
     px_per_mm = (centres[1] - centres[0]) / 2
     assert (np.abs(px_per_mm) > 1).all()
-    still = renderer.irradiance("laser", sensor_at(), spp=512).astype(float)
-    blurred = renderer.irradiance("laser", sensor_at(), spp=512, travel=travel(exposure_mm)).astype(float)
+    still = renderer.laser_frame(sensor_at(), spp=512).irradiance().astype(float)
+    blurred = renderer.laser_frame(sensor_at(), spp=512, travel=travel(exposure_mm)).irradiance().astype(float)
     (to_rest_frame, narrow), (moving, wide) = moments(still), moments(blurred)
     # An even motion over L px has the variance L^2 / 12; the plate runs away from the camera by 0.3 % per mm.
     np.testing.assert_allclose(wide - narrow, (exposure_mm * px_per_mm) ** 2 / 12, rtol=0.01 * exposure_mm)
@@ -93,7 +93,7 @@ def test_a_rolling_shutter_shifts_each_row_by_its_delay(renderer):
             rolled.centre_px[line], abs=2e-3
         )
     assert np.abs(rolled.centre_px - centre).max() > 1
-    image = renderer.irradiance("laser", pose, spp=256, travel=travel(row_mm=delay)).astype(float)
+    image = renderer.laser_frame(pose, spp=256, travel=travel(row_mm=delay)).irradiance().astype(float)
     np.testing.assert_allclose(moments(image)[0], rolled.centre_px, atol=0.05)
 
 
@@ -105,13 +105,13 @@ def test_an_exposure_under_any_twist_is_the_mean_of_still_frames_along_it(render
     """
     turn, velocity, exposure_s = np.array([0.6, -0.4, 0.8]), np.array([30.0, 20.0, -40.0]), 0.05
     way = Travel(velocity_mm_s=velocity, turn_rad_s=turn, exposure_s=exposure_s)
-    moving = renderer.irradiance("laser", sensor_at(), spp=512, travel=way).astype(float)
+    moving = renderer.laser_frame(sensor_at(), spp=512, travel=way).irradiance().astype(float)
     still = []
     for at_s in np.linspace(-0.5, 0.5, 17) * exposure_s:
         pose = np.eye(4)
         pose[:3, :3] = Rotation.from_rotvec(turn * at_s).as_matrix()
         pose[:3, 3] = velocity * at_s
-        still.append(renderer.irradiance("laser", pose, spp=64).astype(float))
+        still.append(renderer.laser_frame(pose, spp=64).irradiance().astype(float))
     weights = np.r_[0.5, np.ones(15), 0.5]
     (mean, spread), (expected, wide) = moments(moving), moments(np.average(still, axis=0, weights=weights))
     np.testing.assert_allclose(mean, expected, atol=0.05)

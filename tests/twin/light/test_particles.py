@@ -13,7 +13,7 @@ from twin.light.particles import Spots, _draw_out, bubble, diffuse_sphere
 from twin.light.pose import Travel
 from twin.light.renderer import Renderer
 from twin.recording.sensor_simulator import SensorSimulator
-from twin.rendering_options import NONE, Options
+from twin.rendering_options import NONE, Flaws, Options
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Sensor
 
@@ -44,7 +44,7 @@ def test_many_bodies_scatter_as_a_haze_of_the_same_cross_section(small, body, wa
     hazy = Renderer(small, medium, scene_of(FAR_AWAY), effects=replace(NONE, haze=True))
     haze = hazy.laser_frame(sensor_at(), spp=1).haze
     count = 20_000.0
-    drifting = Renderer(small, medium, scene_of(FAR_AWAY), effects=NONE, drifting={body: count})
+    drifting = Renderer(small, medium, scene_of(FAR_AWAY), effects=NONE, flaws=Flaws(**{body: count}))
     # Moving through the water lights more bodies for a shorter time each.
     moved = Travel(np.array([way_mm, way_mm, 0.0]), 1.0) if way_mm else None
     frames = [drifting.laser_frame(sensor_at(), spp=1, seed=seed, through_water=moved).particles for seed in range(40)]
@@ -66,11 +66,11 @@ def test_many_bodies_scatter_as_a_haze_of_the_same_cross_section(small, body, wa
 
 def test_nothing_is_seen_behind_a_plate_or_without_light(small):
     medium = clear()
-    dark = Renderer(small, medium, scene_of(FAR_AWAY), effects=NONE, drifting={"particles": 0.0})
+    dark = Renderer(small, medium, scene_of(FAR_AWAY), effects=NONE, flaws=Flaws(particles=0.0))
     assert not dark.laser_frame(sensor_at(), spp=1).particles.any()
     near = scene_of(plate(-60.0, side=600.0))
     free, hidden = (
-        Renderer(small, medium, scene, effects=NONE, drifting={"particles": 20_000.0})
+        Renderer(small, medium, scene, effects=NONE, flaws=Flaws(particles=20_000.0))
         .laser_frame(sensor_at(), spp=1)
         .particles
         for scene in (scene_of(FAR_AWAY), near)
@@ -82,7 +82,7 @@ def test_nothing_is_seen_behind_a_plate_or_without_light(small):
 
 
 def test_equal_seeds_give_equal_bodies_and_a_flat_disc_keeps_its_light(small):
-    renderer = Renderer(small, clear(), scene_of(FAR_AWAY), effects=NONE, drifting={"particles": 5000.0})
+    renderer = Renderer(small, clear(), scene_of(FAR_AWAY), effects=NONE, flaws=Flaws(particles=5000.0))
     first, again, other = (renderer.laser_frame(sensor_at(), spp=1, seed=seed).particles for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert not np.array_equal(first, other)
@@ -121,7 +121,7 @@ def test_a_track_has_the_light_of_a_gaussian_crossed_at_a_constant_speed():
 
 def test_tracks_are_as_long_as_the_image_moves(thesis):
     sensor, medium = cropped(thesis, 500, 300), clear()
-    renderer = Renderer(sensor, medium, scene_of(FAR_AWAY), effects=NONE, drifting={"particles": 4000.0})
+    renderer = Renderer(sensor, medium, scene_of(FAR_AWAY), effects=NONE, flaws=Flaws(particles=4000.0))
     # 4 mm along the stripe, in the sheet; seen about the middle of the volume.
     seen = seen_at(sensor, medium, np.array([[0.0, -2.0, 0.0], [0.0, 2.0, 0.0]]))
     expected = np.linalg.norm(seen[1] - seen[0])
@@ -149,8 +149,8 @@ def test_the_sensor_moves_through_the_water_by_its_own_motion_less_the_current(s
     ):
         scene = scene_of(plate(), motion=moves, current_mm_per_s=current)
         simulator = SensorSimulator(timed, scene, Options(effects=replace(NONE, motion=True)))
-        travel = simulator.through_water(next(scene.motion.shots()))
+        travel = simulator.travel(next(scene.motion.shots()), in_water=True)
         assert travel is not None and travel.exposure_s == pytest.approx(8e-3)
         np.testing.assert_allclose(travel.velocity_mm_s, expected)
         still = SensorSimulator(timed, scene, Options(effects=NONE))
-        assert still.through_water(next(scene.motion.shots())) is None
+        assert still.travel(next(scene.motion.shots()), in_water=True) is None

@@ -50,7 +50,7 @@ def shares(medium: Medium, edges: np.ndarray) -> np.ndarray:
     fine = 400
     steps = np.diff(edges)[:, None] / fine
     middle = one_minus_cosine(edges[:-1, None] + steps * (np.arange(fine) + 0.5))
-    value = Scattering(medium, 635.0).phase(to_jit(mi.Float, middle)).numpy().astype(float).reshape(middle.shape)
+    value = Scattering(medium, 635.0).phase(to_jit(middle)).numpy().astype(float).reshape(middle.shape)
     return (value * math.pi * middle * (2 - middle) * steps).sum(axis=1)
 
 
@@ -207,7 +207,7 @@ def test_what_is_evaluated_integrates_to_one(name):
 def test_what_is_evaluated_is_the_mixture_of_the_functions(name):
     medium = MEDIA[name]
     one_minus = one_minus_cosine(places(3000))
-    found = Scattering(medium, 635.0).phase(to_jit(mi.Float, one_minus)).numpy()
+    found = Scattering(medium, 635.0).phase(to_jit(one_minus)).numpy()
     angle = 2 * np.arcsin(np.sqrt(np.float32(one_minus).astype(float) / 2))
     parts = medium.scatterers(635.0)
     # Petzold's own integral is 0.993723 by the trapezoidal rule over the logarithm of the angle, with 1e6 steps, and
@@ -266,7 +266,7 @@ def drawn(medium: Medium, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarra
     rng = np.random.default_rng(20)
     before = rng.normal(size=3)
     before = np.float32(before / np.linalg.norm(before))
-    u = mi.Point2f(*(to_jit(mi.Float, rng.random(count)) for _ in range(2)))
+    u = mi.Point2f(*(to_jit(rng.random(count)) for _ in range(2)))
     after, density = directions_after(Scattering(medium, 635.0), mi.Vector3f(*map(float, before)), u)
     return before.astype(float), to_numpy(after).astype(float), density.numpy()
 
@@ -297,7 +297,7 @@ def test_directions_are_drawn_as_the_phase_function_says(name):
     # The density goes with the direction, as far as 32 bits of the direction let one find the angle again.
     one_minus = ((after - before) ** 2).sum(axis=1) / 2
     far = (one_minus > 1e-6) & (one_minus < 1.99)
-    again = Scattering(medium, 635.0).phase(to_jit(mi.Float, one_minus)).numpy()
+    again = Scattering(medium, 635.0).phase(to_jit(one_minus)).numpy()
     assert far.sum() > 0.2 * count
     np.testing.assert_allclose(again[far], density[far], rtol=5e-4)
 
@@ -315,7 +315,7 @@ def test_directions_are_even_about_the_axis(name):
 @pytest.mark.parametrize("name", MEDIA)
 def test_angles_grow_with_the_number_from_which_they_are_drawn(name):
     u = np.linspace(0, 1 - 2**-24, 200_001)
-    numbers = mi.Point2f(to_jit(mi.Float, u), 0.3)
+    numbers = mi.Point2f(to_jit(u), 0.3)
     after, density = directions_after(Scattering(MEDIA[name], 635.0), mi.Vector3f(0.0, 0.0, 1.0), numbers)
     directions = to_numpy(after).astype(float)
     assert np.isfinite(directions).all()
@@ -329,7 +329,7 @@ def test_angles_grow_with_the_number_from_which_they_are_drawn(name):
 def test_another_water_needs_no_new_kernel():
     def use(medium: Medium) -> None:
         scattering = Scattering(medium, 635.0)
-        u = mi.Point2f(to_jit(mi.Float, np.linspace(0, 0.99, 1234)), to_jit(mi.Float, np.linspace(0, 0.99, 1234)))
+        u = mi.Point2f(to_jit(np.linspace(0, 0.99, 1234)), to_jit(np.linspace(0, 0.99, 1234)))
         after, density = directions_after(scattering, mi.Vector3f(0.0, 0.6, 0.8), u)
         dr.eval(after, density, scattering.phase(u.x))
 

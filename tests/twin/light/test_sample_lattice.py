@@ -59,7 +59,7 @@ def test_few_samples_leave_a_blurred_stripe_where_it_is(thesis, along: str):
     centre, width = {}, {}
     cases = {"few": (blurred, 16), "odd": (blurred, 17), "many": (blurred, 1024), "sharp": (sharp, 64)}
     for name, (renderer, spp) in cases.items():
-        image = renderer.irradiance("laser", sensor_at(), spp=spp).astype(float)
+        image = renderer.laser_frame(sensor_at(), spp=spp).irradiance().astype(float)
         image = image if along == "width" else image.T
         across = np.arange(96)[:, None]
         centre[name] = (across * image).sum(axis=0) / image.sum(axis=0)

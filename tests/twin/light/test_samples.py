@@ -21,7 +21,7 @@ def renderer(thesis):
 @pytest.fixture(scope="module")
 def reference(renderer):
     """Irradiance with 16384 samples per pixel."""
-    return renderer.irradiance("laser", sensor_at(), spp=16384).astype(float)
+    return renderer.laser_frame(sensor_at(), spp=16384).irradiance().astype(float)
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def stripe(reference):
 
 def worst(renderer: Renderer, reference: np.ndarray, stripe: np.ndarray, spp: int) -> float:
     """Return the largest error of a stripe's pixel, relative to the brightest pixel."""
-    image = renderer.irradiance("laser", sensor_at(), spp=spp).astype(float)
+    image = renderer.laser_frame(sensor_at(), spp=spp).irradiance().astype(float)
     return np.abs(image - reference)[stripe].max() / reference.max()
 
 
@@ -49,7 +49,7 @@ def test_error_falls_with_the_square_of_the_samples(renderer, reference, stripe)
 
 def test_stripe_pixels_are_unbiased_in_the_mean(renderer, reference, stripe):
     for spp in (3, 5, 16):
-        image = renderer.irradiance("laser", sensor_at(), spp=spp).astype(float)
+        image = renderer.laser_frame(sensor_at(), spp=spp).irradiance().astype(float)
         assert image[stripe].sum() == pytest.approx(reference[stripe].sum(), rel=1e-3), spp
 
 
@@ -58,7 +58,7 @@ def test_sixteen_samples_find_the_stripes_centre(thesis, along):
     # The detector's noise leaves some 0.02 px of a stripe's centre; samples must add far less than that.
     sensor = altered(thesis, {"camera": {"stripe_along": along, "width_px": 64, "height_px": 64}})
     renderer = Renderer(sensor, clear(0.3), scene_of(plate()), effects=NONE)
-    images = [renderer.irradiance("laser", sensor_at(), spp=spp).astype(float) for spp in (16, 4096)]
+    images = [renderer.laser_frame(sensor_at(), spp=spp).irradiance().astype(float) for spp in (16, 4096)]
     if along == "height":
         images = [image.T for image in images]
     few, many = (np.arange(64) @ image / image.sum(axis=0) for image in images)
@@ -66,7 +66,7 @@ def test_sixteen_samples_find_the_stripes_centre(thesis, along):
 
 
 def test_equal_arguments_give_equal_images(renderer):
-    first, again = (renderer.irradiance("laser", sensor_at(), spp=4) for _ in range(2))
+    first, again = (renderer.laser_frame(sensor_at(), spp=4).irradiance() for _ in range(2))
     np.testing.assert_array_equal(first, again)
 
 
@@ -96,10 +96,10 @@ def test_wide_stripes_take_fewer_samples_where_they_are_smooth(thesis, monkeypat
         return whole(self, *arguments, spp=spp, **kwargs)
 
     monkeypatch.setattr(Renderer, "_render_pixels", counted)
-    image = renderer.irradiance("laser", sensor_at(), spp=16)
+    image = renderer.laser_frame(sensor_at(), spp=16).irradiance()
     few, rendered = rendered, 0
     monkeypatch.setattr("twin.light.renderer._WIDE_PX", math.inf)
-    everywhere = renderer.irradiance("laser", sensor_at(), spp=16)
+    everywhere = renderer.laser_frame(sensor_at(), spp=16).irradiance()
     assert 0.2 * rendered < few < 0.7 * rendered
     change = np.abs(image - everywhere) / everywhere.max()
     # Means over a pixel by four samples are off by a part of the second difference, which is 1e-3 at most.

@@ -12,7 +12,7 @@ from tests.virtual_sensors import clear, oracle_paths, scene_of, sensor_at
 from twin.backend.arrays import to_jit, to_numpy
 from twin.light.renderer import Renderer
 from twin.recording.frame_truth import find_true_stripe
-from twin.scene.forms.flawed_parts import Weld, weld_height
+from twin.scene.forms.parts import Weld, weld_height
 from twin.scene.objects import Objects, build_objects
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.storage.truth import TruthStatus
@@ -31,7 +31,7 @@ def hits(objects: Objects, start: np.ndarray, direction: np.ndarray) -> tuple[np
 
     Return positions and normals (N, 3), and the hit mask (N,).
     """
-    o, d = mi.Point3f(*(to_jit(mi.Float, c) for c in start.T)), mi.Vector3f(*(float(c) for c in direction))
+    o, d = mi.Point3f(*(to_jit(c) for c in start.T)), mi.Vector3f(*(float(c) for c in direction))
     si = objects.scene.ray_intersect(mi.Ray3f(o, d))
     dr.eval(si.t, si.p, si.n)
     return to_numpy(si.p), to_numpy(si.n), si.is_valid().numpy()

@@ -83,7 +83,7 @@ def fan_rays(laser: Laser, angle: np.ndarray) -> np.ndarray:
 
 def light_at(sheet: Sheet, points: np.ndarray) -> dict[str, np.ndarray]:
     """Return the light of the sheet at points (N, 3), in double precision."""
-    light = sheet.evaluate(mi.Point3f(*[to_jit(mi.Float, column) for column in points.T]))
+    light = sheet.evaluate(mi.Point3f(*[to_jit(column) for column in points.T]))
     dr.eval(light)
     names = ("distance_mm", "sigma_mm", "irradiance", "exit_mm")
     values = {name: getattr(light, name).numpy().astype(float) for name in names}
@@ -352,7 +352,7 @@ def test_a_table_is_drawn_from_by_the_inverse_of_its_integral():
     nodes, density = np.linspace(-2.0, 4.0, 7), np.array([0.0, 3.0, 1.0, 0.0, 0.0, 2.0, 5.0])
     table = PowerTable(nodes, density, power_w=0.02)
     u = (np.arange(4001) + 0.5) / 4001
-    x = table.draw(to_jit(mi.Float, u)).numpy().astype(float)
+    x = table.draw(to_jit(u)).numpy().astype(float)
     # The integral of each cell's straight line, up to x, by Simpson's rule, which is exact for it.
     cell = np.clip((x + 2).astype(int), 0, 5)
     part = x - nodes[cell]
@@ -364,13 +364,13 @@ def test_a_table_is_drawn_from_by_the_inverse_of_its_integral():
     assert not ((x > 1) & (x < 2)).any(), "nothing where there is no power"
     grid = np.linspace(-3, 5, 801)
     expected = 0.02 * np.interp(grid, nodes, density, left=0.0, right=0.0) / before[-1]
-    np.testing.assert_allclose(table.evaluate(to_jit(mi.Float, grid)).numpy(), expected, rtol=0, atol=2e-8)
+    np.testing.assert_allclose(table.evaluate(to_jit(grid)).numpy(), expected, rtol=0, atol=2e-8)
 
 
 def drawn(sheet: Sheet, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Origins and directions (N, 3) of rays drawn from the sheet."""
     u = np.random.default_rng(seed).random((3, count), dtype=np.float32)
-    origin, direction = sheet.sample(mi.Point3f(*[to_jit(mi.Float, column) for column in u]))
+    origin, direction = sheet.sample(mi.Point3f(*[to_jit(column) for column in u]))
     dr.eval(origin, direction)
     return to_numpy(origin).astype(float), to_numpy(direction).astype(float)
 
@@ -430,7 +430,7 @@ def test_the_numbers_0_and_almost_1_give_rays(thesis):
         sheet = Sheet(altered(thesis, {"laser": LASERS[name]}), WATER)
         ends = np.array([0.0, 0.5, 1 - 2**-24])
         u = np.stack(np.meshgrid(ends, ends, ends), axis=-1).reshape(-1, 3)
-        origin, direction = map(to_numpy, sheet.sample(mi.Point3f(*[to_jit(mi.Float, column) for column in u.T])))
+        origin, direction = map(to_numpy, sheet.sample(mi.Point3f(*[to_jit(column) for column in u.T])))
         assert np.isfinite(origin).all()
         assert np.isfinite(direction).all()
         assert np.ptp(direction[:, 1]) > 0.4, "the fan's two edges"
@@ -439,7 +439,7 @@ def test_the_numbers_0_and_almost_1_give_rays(thesis):
 def test_a_waist_at_the_origin_of_a_bare_fan_gives_rays(thesis):
     # All rays of the fan meet there, and the normal of the surface is undefined.
     sensor = altered(thesis, {"laser": {"waist_distance_mm": 1e-6, "window": {"mounted": False}}})
-    u = mi.Point3f(*(to_jit(mi.Float, np.linspace(0.01, 0.99, 50)) for _ in range(3)))
+    u = mi.Point3f(*(to_jit(np.linspace(0.01, 0.99, 50)) for _ in range(3)))
     origin, direction = map(to_numpy, Sheet(sensor, Medium(kind="air")).sample(u))
     assert np.isfinite(origin).all()
     np.testing.assert_allclose(np.linalg.norm(direction, axis=1), 1.0, atol=1e-6)

@@ -9,8 +9,8 @@ import pytest
 from scipy import stats
 
 from tests.bench.light import in_named_water
+from twin.light.multiple_scattering import FoundLight, blur_cells, estimate_light, interpolate_cells
 from twin.light.renderer import Renderer
-from twin.light.smoothing import FoundLight, blur_cells, estimate_light, interpolate_cells
 from twin.rendering_options import Options
 from twin.scene.description import load_scene
 

@@ -22,7 +22,7 @@ COLUMN = 60
 
 def render_column(sensor: Sensor, thing: dict[str, Any]) -> tuple[np.ndarray, Renderer]:
     renderer = Renderer(sensor, clear(), scene_of(thing), effects=NONE)
-    return renderer.irradiance("laser", sensor_at(), spp=64)[:, COLUMN].astype(float), renderer
+    return renderer.laser_frame(sensor_at(), spp=64).irradiance()[:, COLUMN].astype(float), renderer
 
 
 def positions_across(sensor: Sensor, renderer: Renderer, rotation: tuple[float, float, float]) -> np.ndarray:
@@ -72,7 +72,7 @@ def test_truth_and_light_of_opaque_objects_are_unchanged_beside_translucent_ones
     images, truths = [], []
     for path in (0.0, PATH):
         renderer = Renderer(sensor, clear(), scene_of(opaque, beside | {"mean_free_path_mm": path}), effects=NONE)
-        images.append(renderer.irradiance("laser", sensor_at(), spp=16))
+        images.append(renderer.laser_frame(sensor_at(), spp=16).irradiance())
         truths.append(find_true_stripe(renderer, sensor_at()))
     columns = np.flatnonzero(np.isfinite(truths[0].centre_px))
     left = columns[truths[0].point_mm[columns, 1] < -0.5]

@@ -53,9 +53,9 @@ def walked(renderer: Renderer, pixels: np.ndarray, walks: int, *, seed: int = 0)
     each = walks // BATCHES
     cell = np.repeat(np.arange(len(pixels) * BATCHES), each)
     x, y = pixels[cell // BATCHES].T
-    bundle = renderer.view.trace_bundle(to_jit(mi.Float, x), to_jit(mi.Float, y))
+    bundle = renderer.view.trace_bundle(to_jit(x), to_jit(y))
     sums = np.zeros(len(pixels) * BATCHES)
-    for where, *parts in walker.trace(bundle, to_jit(mi.UInt32, cell), seed=seed):
+    for where, *parts in walker.trace(bundle, mi.UInt32(cell), seed=seed):
         for light in parts:
             sums += np.bincount(where, light, len(sums))
     batches = sums.reshape(len(pixels), BATCHES) / each

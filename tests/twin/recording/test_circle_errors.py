@@ -9,7 +9,7 @@ import pytest
 
 from tests.virtual_sensors import altered, camera_axes, scene_of, sensor_at
 from twin.light.renderer import Renderer
-from twin.recording.frame_truth import depth_map
+from twin.recording.frame_truth import find_visible_surfaces
 from twin.recording.record_scene import record_scene
 from twin.recording.sensor_simulator import SensorSimulator, with_window
 from twin.rendering_options import NONE, Options
@@ -202,7 +202,8 @@ def test_a_bowed_plate_is_a_piece_of_a_sphere(thesis, bow_mm):
     sensor = with_window(sensor, mounted=False)
     size = {"width_mm": width, "height_mm": height}
     scene = scene_of(PLATE | size | {"position_mm": (2.0, -3.0, 5.0), "bow_mm": bow_mm})
-    depth = depth_map(Renderer(sensor, sensor.media["air"], scene, effects=NONE), sensor_at()).astype(float)
+    renderer = Renderer(sensor, sensor.media["air"], scene, effects=NONE)
+    depth = find_visible_surfaces(renderer, sensor_at())[0].astype(float)
     v, u = np.nonzero(np.isfinite(depth))
     pinhole = (np.stack([u, v], axis=1) - sensor.camera.principal_point()) / sensor.camera.focal_length_px()
     seen = depth[v, u][:, None] * np.column_stack([pinhole, np.ones(len(u))])

@@ -14,6 +14,7 @@ from twin.recording.sensor_simulator import SensorSimulator
 from twin.rendering_options import NONE, Flaws, Options
 from twin.sensor.detector import dirt
 from uwlts.errors import DescriptionError
+from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture
 from uwlts.storage.truth import TruthStatus, read_truth, truth_path
@@ -110,9 +111,9 @@ def test_a_ring_lamp_is_seen_mirrored_by_the_window(thesis, tilt):
     window = {"tilt_x_deg": tilt[0], "tilt_y_deg": tilt[1]}
     (inner, outer), images = RING_MM, []
     for f_number in (100.0, 4.0):
-        sensor = altered(thesis, {"camera": {"f_number": f_number, "window": window}})
-        view, lamp = CameraView(sensor, clear()), {"irradiance_w_per_m2": 4.0, "distance_mm": 400.0}
-        images.append(reflect_ring(view, sensor, reflectance=0.02, **lamp).astype(float))
+        changes = {"camera": {"f_number": f_number, "window": window}, "lamp": {"irradiance_w_per_m2": 4.0}}
+        sensor = altered(thesis, changes)
+        images.append(reflect_ring(CameraView(sensor, clear()), sensor, reflectance=0.02).astype(float))
     camera, image = sensor.camera, images[0]
     y, x = np.indices(image.shape)
     cx, cy = camera.principal_point()
@@ -127,8 +128,8 @@ def test_a_ring_lamp_is_seen_mirrored_by_the_window(thesis, tilt):
     # Seen slanted by the tilt, the ring is an ellipse to 0.1 mm; a cell of 4 px is 0.2 mm, the blur of f/100 0.1 mm.
     assert image[inside].max() < 0.02 * image.max() and image[away > outer + 0.6].max() < 0.02 * image.max()
     # The radiance of a ring that illuminates surfaces with 4 W/m2, by a sum over its elements, through the lens.
-    radius = np.linspace(inner, outer, 2001)
-    per_radiance = np.trapezoid(2 * np.pi * radius * 400.0**2 / (400.0**2 + radius**2) ** 2, radius)
+    radius, depth = np.linspace(inner, outer, 2001), camera_from_object(sensor)[2, 3]
+    per_radiance = np.trapezoid(2 * np.pi * radius * depth**2 / (depth**2 + radius**2) ** 2, radius)
     working = 100.0 * (1 + camera.focal_length_mm / (camera.focus_distance_mm - camera.focal_length_mm))
     expected = 0.02 * 4e-6 / per_radiance * np.pi / 4 / working**2
     cosine = 1 / np.sqrt(1 + ((x - cx) ** 2 + (y - cy) ** 2) / focal**2)
@@ -194,7 +195,8 @@ def test_laser_light_passes_red_filters_and_the_lamps_all(sensor, apart):
 def test_the_uneven_lamp_lights_places_and_not_pixels(sensor):
     medium, loss, z = clear(), 0.6, 30.0
     even, uneven = (
-        Renderer(sensor, medium, scene_of(plate(z)), effects=NONE, uneven_lamp=share) for share in (0.0, loss)
+        Renderer(sensor, medium, scene_of(plate(z)), effects=NONE, flaws=Flaws(uneven_lamp=share))
+        for share in (0.0, loss)
     )
     ratio = uneven.irradiance("lamp", sensor_at(), spp=16) / even.irradiance("lamp", sensor_at(), spp=16)
     x, y = (g.ravel() for g in np.meshgrid(np.linspace(-50, 50, 11), np.linspace(-45, 45, 11)))

@@ -24,7 +24,6 @@ from tests.virtual_sensors import (
 from twin.light.renderer import Renderer
 from twin.recording.frame_truth import (
     FrameTruth,
-    depth_map,
     find_crossings,
     find_true_stripe,
     find_visible_surfaces,
@@ -82,7 +81,7 @@ def test_the_rendered_stripe_lies_about_its_true_centre(thesis):
     sensor = cropped(thesis, 64, 512)
     renderer = Renderer(sensor, clear(0.3), scene_of(plate()), effects=NONE)
     for z in (-40.0, 0.0, 40.0):
-        image = renderer.irradiance("laser", sensor_at(-z), spp=256).astype(float)
+        image = renderer.laser_frame(sensor_at(-z), spp=256).irradiance().astype(float)
         truth = find_true_stripe(renderer, sensor_at(-z))
         assert (truth.status == TruthStatus.VISIBLE).all()
         centroid = np.arange(512) @ image / image.sum(axis=0)
@@ -174,7 +173,7 @@ def test_true_points_lie_on_a_mesh(thesis, tmp_path):
 def test_the_depth_map_is_the_camera_frame_z_of_what_pixels_see(thesis):
     sensor, medium = coarse(thesis), clear()
     renderer = Renderer(sensor, medium, scene_of(plate(25.0, side=100.0)))
-    depth = depth_map(renderer, sensor_at())
+    depth = find_visible_surfaces(renderer, sensor_at())[0]
     assert depth.shape == (256, 320)
     x, y = (g.ravel() for g in np.meshgrid(np.linspace(-45, 45, 13), np.linspace(-45, 45, 13)))
     points = np.stack([x, y, np.full_like(x, 25.0)], axis=1)
@@ -263,7 +262,7 @@ def test_lines_whose_stripe_is_shaded_or_hidden_have_none(thesis, name):
     status = truth.status[lines.astype(int)]
     expected = np.where(blocked > 0, TruthStatus.NO_STRIPE, TruthStatus.VISIBLE)
     np.testing.assert_array_equal(status[clear_cut], expected[clear_cut])
-    image = renderer.irradiance("laser", sensor_at(), spp=4)
+    image = renderer.laser_frame(sensor_at(), spp=4).irradiance()
     bright = image[:, 30:290:2].max(axis=0) > 0.05 * image.max()
     # A pixel at the edge of the shadow is partly lit, and the lit half of the stripe is visible beside a hidden point.
     inner = np.convolve(blocked > 0, np.ones(3), "same")

@@ -41,8 +41,8 @@ def bsdf_of(finish: dict[str, object], **optics: float) -> mi.BSDF:
 def evaluated(bsdf: mi.BSDF, towards: np.ndarray, light: np.ndarray) -> np.ndarray:
     """BSDF times cosine (N,) for unit directions (N, 3) towards viewer and light in the surface's frame."""
     si = dr.zeros(mi.SurfaceInteraction3f, len(towards))
-    si.wi = mi.Vector3f(*(to_jit(mi.Float, column) for column in towards.T))
-    return bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(*(to_jit(mi.Float, column) for column in light.T)))[0].numpy()
+    si.wi = mi.Vector3f(*(to_jit(column) for column in towards.T))
+    return bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(*(to_jit(column) for column in light.T)))[0].numpy()
 
 
 def tilted(cosine: np.ndarray | float, azimuth: np.ndarray | float = 0.0) -> np.ndarray:
@@ -159,7 +159,7 @@ def built(scene: Scene, **changes: object) -> Objects:
 def hit(objects: Objects, start: np.ndarray, towards: np.ndarray) -> mi.SurfaceInteraction3f:
     """Intersect rays (N, 3) with the objects."""
     start, towards = np.broadcast_arrays(np.asarray(start, float), np.asarray(towards, float))
-    o, d = (mi.Vector3f(*(to_jit(mi.Float, np.atleast_1d(c)) for c in v.T)) for v in (start, towards))
+    o, d = (mi.Vector3f(*(to_jit(np.atleast_1d(c)) for c in v.T)) for v in (start, towards))
     return objects.scene.ray_intersect(mi.Ray3f(mi.Point3f(o), d))
 
 

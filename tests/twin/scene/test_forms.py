@@ -8,7 +8,7 @@ import trimesh
 from pydantic import ValidationError
 
 from twin.scene.forms import Flange, Seabed
-from twin.scene.forms.flange import flange_face
+from twin.scene.forms.parts import flange_face
 from twin.scene.forms.seabed import _sediment_height
 from twin.scene.forms.triangles import rounded_box
 from twin.scene.scene_object import FreeForm

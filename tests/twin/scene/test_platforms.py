@@ -44,7 +44,7 @@ def test_a_path_is_travelled_at_its_speed_with_the_sensor_where_the_waypoints_sa
     sensor = course.poses(times)
     np.testing.assert_allclose(sensor[:, 0, 3], 100 * times, atol=1e-9)
     np.testing.assert_allclose(course.reported @ MOUNT.matrix(), sensor, atol=1e-9)
-    velocity, turn = course.twist(course.shots[30], exposure_s=0.01)
+    velocity, turn = path.twist(course.shots[30], exposure_s=0.01)
     np.testing.assert_allclose([*velocity, *turn], [100, 0, 0, 0, 0, 0], atol=1e-8)
     np.testing.assert_allclose([shot.travelled_mm for shot in course.shots], 100 * times, atol=1e-9)
 
@@ -95,7 +95,7 @@ def test_stops_take_all_images_at_the_same_place():
     for place in range(4):
         expected = Pose(**path.waypoints[place].model_dump()).matrix()
         np.testing.assert_allclose(course.reported[3 * place : 3 * place + 3], [expected] * 3, atol=1e-12)
-        np.testing.assert_allclose(course.twist(course.shots[3 * place], exposure_s=0.01), 0, atol=1e-12)
+        np.testing.assert_allclose(path.twist(course.shots[3 * place], exposure_s=0.01), 0, atol=1e-12)
 
 
 def test_a_guide_errs_by_the_ranges_of_its_description():
@@ -140,7 +140,7 @@ def test_a_table_turns_the_sensor_the_other_way_round_its_axis():
     assert 5 < np.degrees(angle_of(off, poses).max()) * 3600 < 30 * 4 / 3 * 2**0.5
     moving = RotaryTable(kind="rotary_table", count=11, turn_deg=-100.0, speed_deg_per_s=20.0)
     assert moving.frame_rate_hz == pytest.approx(2.0)
-    _, turn = moving.course().twist(moving.shots()[3], exposure_s=0.01)
+    _, turn = moving.twist(moving.shots()[3], exposure_s=0.01)
     np.testing.assert_allclose(turn, [0, 0, np.radians(20)], atol=1e-9)
 
 
@@ -189,9 +189,11 @@ def test_a_gyro_bias_bends_the_path_to_the_side_of_the_heading_error(heading_deg
         return straight
 
     navigation = Navigation(gyro_bias_deg_per_s=0.005)
-    drift = simulate_drift(navigation, poses, lead_s=1.0, lasting_s=100.0, rng=np.random.default_rng(1))
+    errors_at, covariance_at = simulate_drift(
+        navigation, poses, lead_s=1.0, lasting_s=100.0, rng=np.random.default_rng(1)
+    )
     times, left = np.linspace(0, 100.0, 1001), np.array([-np.sin(heading), np.cos(heading)])
-    error, covariance = drift.errors(times), drift.covariance(times[-1:])[0]
+    error, covariance = errors_at(times), covariance_at(times[-1:])[0]
     aside = np.trapezoid(200 * error[:, 5], times)
     assert abs(aside) > 1.0
     np.testing.assert_allclose(error[-1, :2] - error[0, :2], aside * left, atol=0.02 * abs(aside))
@@ -222,8 +224,10 @@ def test_the_navigation_states_the_covariance_of_its_errors():
 
     total, at = 0.0, np.array([100.0])
     for number in range(200):
-        drift = simulate_drift(navigation, poses, lead_s=1.0, lasting_s=100.0, rng=np.random.default_rng(number))
-        error, covariance = drift.errors(at)[0], drift.covariance(at)[0]
+        rng = np.random.default_rng(number)
+        error, covariance = (
+            each(at)[0] for each in simulate_drift(navigation, poses, lead_s=1.0, lasting_s=100.0, rng=rng)
+        )
         total += error @ np.linalg.solve(covariance, error)
     assert abs(total - 1200) < 5 * 49
     assert np.sqrt(covariance[1, 1]) > 50, "heading errors cause cross-track errors"
@@ -247,7 +251,7 @@ def test_a_vehicle_shakes_and_reports_a_path_that_drifts(tmp_path):
     drift = np.sqrt(np.trace(course.covariance[:, :3, :3], axis1=1, axis2=2))
     assert drift[-1] > drift[0]
     # 2 pi 25 Hz 0.2 mm is 31 mm/s at the middle of an oscillation, beside the 100 mm/s of the path.
-    velocities = np.array([course.twist(shot, exposure_s=0.002)[0] for shot in course.shots])
+    velocities = np.array([vehicle.twist(shot, exposure_s=0.002)[0] for shot in course.shots])
     assert 10 < np.ptp(velocities[:, 1]) < 63
     Trajectory(*course.report).save(tmp_path / "a.csv")
     read = read_trajectory(tmp_path / "a.csv", pose_format="quaternion-xyzw")

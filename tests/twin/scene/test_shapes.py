@@ -8,8 +8,8 @@ from scipy.signal import argrelmin
 
 from twin.scene import scene_object
 from twin.scene.forms import Head, PittedPipe, Weld
-from twin.scene.forms.flawed_parts import pit_depths, pit_places, pitted_radius, undercut_depths, weld_height
 from twin.scene.forms.head import _front, _outline
+from twin.scene.forms.parts import pit_depths, pit_places, pitted_radius, undercut_depths, weld_height
 from twin.scene.forms.triangles import bowed_plate
 from uwlts.errors import DescriptionError
 

@@ -40,9 +40,7 @@ def built(*things: dict[str, Any], seed: int = 0) -> Objects:
 
 def albedo(objects: Objects, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Albedo (N,) and points (N, 3) that are hit by rays along z."""
-    origin, along = (
-        mi.Point3f(*(to_jit(mi.Float, c) for c in v.T)) for v in (start, np.tile([0, 0, 1.0], (len(start), 1)))
-    )
+    origin, along = (mi.Point3f(*(to_jit(c) for c in v.T)) for v in (start, np.tile([0, 0, 1.0], (len(start), 1))))
     si = objects.scene.ray_intersect(mi.Ray3f(origin, mi.Vector3f(along)))
     found = objects.albedo(si)
     dr.eval(found, si.p)
@@ -154,10 +152,9 @@ def test_patches_have_their_own_reflectance_and_interrupt_the_stripe(thesis: Sen
     found, _ = albedo(built(grown, seed=2), start)
     assert set(np.unique(found.round(5))) == {0.0, 0.5}
     whole, gaps = (
-        Renderer(sensor, clear(), scene_of(thing), effects=NONE, surface_seed=2)
-        for thing in (plate(reflectance=0.5), grown)
+        Renderer(sensor, clear(), scene_of(thing), effects=NONE, seed=2) for thing in (plate(reflectance=0.5), grown)
     )
-    light = [each.irradiance("laser", sensor_at(), spp=16).sum(axis=0) for each in (whole, gaps)]
+    light = [each.laser_frame(sensor_at(), spp=16).irradiance().sum(axis=0) for each in (whole, gaps)]
     share = light[1] / light[0]
     # The stripe is 1 to 2 px wide, so that most lines are within a patch or beside one.
     assert 0.05 < (share < 0.01).mean() < 0.6
@@ -214,15 +211,15 @@ def test_the_rendered_stripe_has_the_spectrum_filtered_by_the_sheet(thesis: Sens
     thing = plate() | {"reflectance": 0.3, "mottle": mottle, "mottle_mm": length}
     lags, found = (0, 1, 2, 5, 10, 20), []
     plain = Renderer(sensor, clear(), scene_of(plate(reflectance=0.3)), effects=NONE)
-    even = plain.irradiance("laser", sensor_at(), spp=16).sum(axis=0)
+    even = plain.laser_frame(sensor_at(), spp=16).irradiance().sum(axis=0)
     light = plain.sheet.evaluate(mi.Point3f(0.0, 0.0, 0.0))
     sigma = float(light.sigma_mm[0])
     bundle = plain.view.trace_bundle(mi.Float([199.0, 200.0]), mi.Float([47.5, 47.5]))
     at_plate = bundle.origin + bundle.direction * (-bundle.origin.z / bundle.direction.z)
     pixel = float(np.ptp(at_plate.y.numpy()))
     for seed in range(30):
-        renderer = Renderer(sensor, clear(), scene_of(thing), effects=NONE, surface_seed=seed)
-        ratio = renderer.irradiance("laser", sensor_at(), spp=16).sum(axis=0) / even - 1
+        renderer = Renderer(sensor, clear(), scene_of(thing), effects=NONE, seed=seed)
+        ratio = renderer.laser_frame(sensor_at(), spp=16).irradiance().sum(axis=0) / even - 1
         found.append([np.mean(ratio[: len(ratio) - k] * ratio[k:]) for k in lags])
     optics = {"sigma_mm": sigma, "pixel_mm": pixel, "length_mm": length, "mottle": mottle}
     expected = np.array([filtered_covariance(k * pixel, **optics) for k in lags])
@@ -246,7 +243,7 @@ def test_a_rounded_edge_of_steel_glints_where_its_normal_bisects_light_and_view(
     side = np.sign(half[0])
     glint = side * 17.0 + 3.0 * half[0]
     places = side * np.arange(12.0, 19.5, 0.15)
-    light = np.array([renderer.irradiance("laser", sensor_at(x=x), spp=16).max() for x in places])
+    light = np.array([renderer.laser_frame(sensor_at(x=x), spp=16).irradiance().max() for x in places])
     # Facets are 3.75 degrees wide, 0.2 mm here.
     assert abs(places[np.argmax(light)] - glint) < 0.3
     flat = light[np.abs(places) < 16.5]

@@ -5,7 +5,6 @@ import pytest
 from scipy import stats
 
 from twin.sensor.detector import FixedPattern, fixed_pattern, grey_values
-from uwlts.errors import ImageError
 from uwlts.model.sensor import Detector
 
 SIDE = 300
@@ -155,15 +154,3 @@ def test_the_pattern_scales_light_only():
         electrons = np.full((SIDE, SIDE), light, np.float32)
         image = grey_values(electrons, chip, exposure_ms=300.0, rng=None, pattern=pattern)
         assert np.abs(image - (500.0 + light * pattern.gain.astype(float))).max() <= 0.5 + 1e-3
-
-
-def test_a_pattern_of_another_size_is_refused():
-    chip = detector(prnu=0.01)
-    with pytest.raises(ImageError, match=r"pattern is of \(30, 40\) pixels, the image of \(40, 30\)"):
-        grey_values(
-            np.zeros((40, 30), np.float32),
-            chip,
-            exposure_ms=1.0,
-            rng=None,
-            pattern=pattern_of(chip, height=30, width=40),
-        )

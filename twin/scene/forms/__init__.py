@@ -1,11 +1,10 @@
 """Objects with closed-form surfaces as fine triangle meshes; they face -z, towards the sensor.
 
-A new form is a module with its description, formula and triangles, and an entry in `AnyForm`.
+A new form is a class with its description, formula and triangles, and an entry in `AnyForm`.
 """
 
-from twin.scene.forms.flange import Flange
-from twin.scene.forms.flawed_parts import PittedPipe, Weld
 from twin.scene.forms.head import Head
+from twin.scene.forms.parts import Flange, PittedPipe, Weld
 from twin.scene.forms.seabed import Seabed
 
 AnyForm = Flange | Head | PittedPipe | Seabed | Weld

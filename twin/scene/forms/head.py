@@ -4,7 +4,7 @@ from typing import Literal
 
 import numpy as np
 
-from twin.scene.forms.triangles import quads
+from twin.scene.forms.triangles import grid_faces
 from twin.scene.scene_object import FreeForm
 from uwlts.model.sensor import Positive
 
@@ -53,11 +53,11 @@ class Head(FreeForm):
 
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
         """Return a closed surface, scaled to its height: 0.57 wide, and 0.79 from nose to back."""
-        return _triangles(self.height_mm)
+        vertices, faces = _unit_triangles()
+        return self.height_mm * vertices, faces
 
 
-def _triangles(height_mm: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices (V, 3) in mm and faces (F, 3) of a dummy head with the stub of its neck, a closed surface."""
+def _unit_triangles() -> tuple[np.ndarray, np.ndarray]:
     # Rows at equal distances along the front outline, from the crown, where it is level, to the neck.
     y = 0.5 - np.square(np.linspace(0, 1, 20 * _ROWS))
     way = np.concatenate([[0], np.cumsum(np.hypot(np.diff(y), np.diff(_outline(y)[1])))])
@@ -70,18 +70,16 @@ def _triangles(height_mm: float) -> tuple[np.ndarray, np.ndarray]:
     sides = np.stack([x, np.broadcast_to(y, x.shape), z], axis=-1).reshape(-1, 3)
 
     ring = np.arange(_COLUMNS)
-    corner = (np.arange(_ROWS - 1)[:, None] * _COLUMNS + ring).ravel()
-    beside = (np.arange(_ROWS - 1)[:, None] * _COLUMNS + np.roll(ring, -1)).ravel()
     crown, cut = len(sides), len(sides) + 1
     last = crown - _COLUMNS + ring
     faces = np.concatenate(
         [
-            quads(corner, beside, beside + _COLUMNS, corner + _COLUMNS),
+            grid_faces((_ROWS, _COLUMNS), closed=True),
             np.stack([np.full_like(ring, crown), np.roll(ring, -1), ring], axis=1),
             np.stack([np.full_like(ring, cut), last, np.roll(last, -1)], axis=1),
         ]
     )
-    return height_mm * np.concatenate([sides, [[0, 0.5, 0], [0, -0.5, 0]]]), faces
+    return np.concatenate([sides, [[0, 0.5, 0], [0, -0.5, 0]]]), faces
 
 
 def _outline(y: np.ndarray) -> np.ndarray:
