@@ -181,41 +181,6 @@ def test_images_with_a_hole(says, scan_images, tmp_path: Path, suffix: str):
     )
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (turned, "512 x 640 pixels; expected 640 x 512 .* rotated by 90 deg: rotate them back"),
-        (lambda image: cv2.resize(image, (320, 256)), "320 x 256 pixels; expected 640 x 512"),
-        (black, "all 5 laser images are black, no pixel reaches 2 % of full scale: is the laser on"),
-        (white, "laser0.png is white: 100 % of its pixels are saturated"),
-    ],
-    ids=["turned", "small", "black", "white"],
-)
-def test_images_that_are_all_wrong(says, scan_images, tmp_path: Path, change, words: str):
-    folder = folder_of(tmp_path / "images", [change(image) for image in scan_images[:5]])
-    says(f"import {folder} --out {tmp_path / 'x.h5'}", words)
-
-
-@pytest.mark.parametrize(
-    ("change", "size", "words"),
-    [
-        (noise, (640, 512), "no stripe in any of the 5 laser images: check which images are laser images"),
-        (turned_square, (512, 512), "no stripe in any of the 5 laser images: in 5 of them one runs across"),
-    ],
-    ids=["noise", "turned"],
-)
-def test_images_without_a_stripe_are_imported_with_a_warning(
-    scan_images, tmp_path: Path, monkeypatch, capfd, change, size, words
-):
-    folder = folder_of(tmp_path / "images", [change(image) for image in scan_images[:5]], size=size)
-    monkeypatch.setattr("sys.argv", ["uwlts", "import", str(folder), "--out", str(tmp_path / "x.h5")])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    _, err = capfd.readouterr()
-    assert ended.value.code == 0 and len(err.strip().splitlines()) == 1
-    assert re.match(f"warning: {words}", err), err
-
-
 # --- Captures of the target
 
 TARGETS: dict[str, tuple[Damage, str]] = {
