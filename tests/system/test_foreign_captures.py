@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.system.in_process import uwlts
 from tests.uwlts.calibration_views import lattice, stage_images
 from tests.uwlts.drawn_stripes import SPHERES, STAGE_MM, coarse_sensor, sphere_profiles, step_image, stripe_image, write
 from tests.uwlts.drawn_target import drawn_lamp, drawn_laser
@@ -217,13 +218,11 @@ def test_captures_of_the_target(says, target_frames, tmp_path: Path, name: str):
     says(f"calibrate --air {path} --out {tmp_path / 'x.json'}", words)
 
 
-def test_the_target_as_it_should_be_calibrates(target_frames, tmp_path: Path, monkeypatch, capfd):
+def test_the_target_as_it_should_be_calibrates(target_frames, tmp_path: Path):
     """The same images undamaged, as a control for the refusals."""
     path = captured(tmp_path / "x.h5", target_frames, target=PLATE)
-    monkeypatch.setattr("sys.argv", ["uwlts", "calibrate", "--air", str(path), "--out", str(tmp_path / "x.json")])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    assert (ended.value.code, capfd.readouterr().err) == (0, "")
+    ended = uwlts("calibrate", "--air", path, "--out", tmp_path / "x.json")
+    assert (ended.returncode, ended.stderr) == (0, "")
 
 
 @pytest.mark.parametrize("name", ["black", "switched", "laser off", "stripe across"])
@@ -298,16 +297,11 @@ def test_scans_of_another_size(says, scan_images, calibration, tmp_path: Path):
     says(f"reconstruct {small} {line}", "640 x 256 pixels, .* 640 x 512: calibrate with images of this size")
 
 
-def test_a_scan_upside_down_gives_hollow_spheres(says, scan_images, calibration, tmp_path: Path, monkeypatch):
+def test_a_scan_upside_down_gives_hollow_spheres(says, scan_images, calibration, tmp_path: Path):
     turned_over = [np.ascontiguousarray(upside_down(image)) for image in scan_images]
     scan = write(tmp_path / "scan.h5", turned_over, stage_mm=STAGE_MM, artefact=SPHERES)
     cloud = tmp_path / "scan.ply"
-    monkeypatch.setattr(
-        "sys.argv", ["uwlts", "reconstruct", str(scan), "--calibration", str(calibration), "--out", str(cloud)]
-    )
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    assert ended.value.code == 0
+    assert uwlts("reconstruct", scan, "--calibration", calibration, "--out", cloud).returncode == 0
     says(f"evaluate {cloud} --out {tmp_path / 'x.json'}", "hollow: .* rotated by 180 deg or mirrored")
 
 

@@ -1,6 +1,5 @@
 """Descriptions of studies, and their designs."""
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -294,9 +293,3 @@ def test_a_damaged_part_is_named(study, tmp_path):
 
 def test_no_parts_are_no_columns(tmp_path):
     assert read_parts(tmp_path) == {}
-    assert math.isnan(
-        evaluate_designs(
-            load_study(written(tmp_path)),
-            [Design(0, {BASELINE: -1.0, "camera.window.glass": "N-BK7", "camera": "small"})],
-        )["line_mm"].item()
-    )
