@@ -144,6 +144,10 @@ class SensorArrays:
 
         return SensorArrays(**{name: taken(values) for name, values in vars(self).items()})
 
+    def each(self, values: Array) -> np.ndarray:
+        """Return one number (N,) for each design."""
+        return np.broadcast_to(np.asarray(values, dtype=float).reshape(-1), (self.baseline_mm.size,)).copy()
+
     def pose(self, xp: ModuleType) -> LaserFan:
         """Return the laser's fan in the camera frame."""
         towards = (1.0 - self.along_width, -self.along_width, 0.0 * self.along_width)

@@ -120,7 +120,8 @@ def verify(
     # Each recording has its own seed, so that the noise is independent.
     jobs = [
         (recording, Options(seed=int(np.random.SeedSequence([seed, k]).generate_state(1)[0])))
-        for k, recording in enumerate(planned.all())
+        for k, recording in enumerate(planned)
+        if recording is not None
     ]
     times = [time.perf_counter()]
     try:
