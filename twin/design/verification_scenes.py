@@ -72,7 +72,7 @@ class LineOfSight:
 
     def line_mm(self, z: float) -> np.ndarray:
         """Return Y values, closely spaced, of the visible line at ``z``; can be empty."""
-        reach = self.depth_mm(z) * self._diagonal_slope()
+        reach = 2 * self.depth_mm(z) * self.camera.corner_slope()
         middle = -self.pose[:3, 1] @ (self.pose[:3, 3] + self.pose[:3, 2] * z)
         y = np.linspace(middle - reach, middle + reach, 1001)
         visible = self.in_image(np.column_stack([np.zeros_like(y), y, np.full_like(y, z)]))
@@ -95,10 +95,7 @@ class LineOfSight:
         length = np.full(len(rays), 1e6)
         np.divide(z - pupil[2], rays[:, 2], out=length, where=rays[:, 2] > 1e-6)
         hits = np.abs(pupil[:2] + length[:, None] * rays[:, :2] - (0.0, y))
-        return np.minimum(hits.max(axis=0), 1.25 * self.depth_mm(z) * self._diagonal_slope() / 2)
-
-    def _diagonal_slope(self) -> float:
-        return 2 * self.camera.corner_slope()
+        return np.minimum(hits.max(axis=0), 1.25 * self.depth_mm(z) * self.camera.corner_slope())
 
 
 def find_longest_run(flags: np.ndarray | list[bool]) -> slice:
