@@ -38,9 +38,9 @@ from twin.design.designs import (
     make_failed_columns,
     sample_designs,
 )
-from twin.design.report.study_page import page_text
-from twin.design.report.study_tables import failure_counts
 from twin.design.study import Study, load_study
+from twin.design.study_page import page_text
+from twin.design.study_tables import failure_counts
 from twin.design.verification import Agreement, verify_candidates
 from twin.recording.campaigns import PLAN, keep_to_plan, make_folder, require_at_least
 from twin.rendering_options import CPU, Variant

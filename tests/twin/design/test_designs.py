@@ -18,8 +18,8 @@ from twin.design.designs import (
     select_design,
 )
 from twin.design.figures_of_merit import FIGURES, RENDERED_SCATTERING_DEPTH
-from twin.design.report.study_tables import format_design_value
 from twin.design.study import Study, load_study
+from twin.design.study_tables import format_design_value
 from twin.design.sweep import encode_part, read_parts, write_csv, write_part
 from uwlts.errors import CaptureError, DescriptionError, DesignError
 from uwlts.model.library import list_names, load_sensor

@@ -22,10 +22,11 @@ from twin.design.designs import (
     sample_designs,
     select_design,
 )
+from twin.design.drawing import make_view
 from twin.design.figures_of_merit import FIGURES
-from twin.design.report.drawing import make_view
-from twin.design.report.study_page import choose_pareto_axes, figures_chart, page_text, pareto_chart, sample
-from twin.design.report.study_tables import (
+from twin.design.study import Study, load_study
+from twin.design.study_page import choose_pareto_axes, figures_chart, page_text, pareto_chart, sample
+from twin.design.study_tables import (
     agreement_text,
     label_of,
     misses,
@@ -35,7 +36,6 @@ from twin.design.report.study_tables import (
     without_numbers,
     words_of,
 )
-from twin.design.study import Study, load_study
 from twin.design.verification import Agreement
 from uwlts.errors import EvaluationError
 from uwlts.model.sensor import Sensor

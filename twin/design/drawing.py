@@ -14,8 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from twin.design.figures_of_merit import evaluate_field
-from twin.design.report.study_tables import number_text
 from twin.design.sensor_arrays import SensorArrays, extract_parameters
+from twin.design.study_tables import number_text
 from uwlts.model.placement import laser_pose
 from uwlts.model.sensor import Camera, Medium, Sensor, Window
 from uwlts.optics.design import Lens, WindowGeometry, standoff_mm, trace_rays, undistort_pixels
