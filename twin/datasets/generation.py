@@ -265,7 +265,8 @@ def dataset(
     described, folder = load_description(description, scenes=scenes, seed=seed), Path(out)
     draw_scene(described, 0)
     jobs = _jobs(described, folder, variant)
-    plan = _plan(described, variant)
+    versions: dict[str, JsonValue] = {package: version(package) for package in ("uwlts", "mitsuba", "drjit")}
+    plan = {"description": described.model_dump(mode="json"), "variant": variant, "versions": versions}
     make_folder(folder)
     if overwrite and (folder / PLAN).is_file():
         for path in folder.iterdir():
@@ -324,12 +325,6 @@ def _jobs(description: DataSetDescription, folder: Path, variant: str) -> list[_
         for first in range(0, len(scenes), size)
     ]
     return sorted(jobs, key=lambda job: job.scenes)
-
-
-def _plan(description: DataSetDescription, variant: str) -> dict[str, JsonValue]:
-    """Return the settings that determine the frames."""
-    versions: dict[str, JsonValue] = {package: version(package) for package in ("uwlts", "mitsuba", "drjit")}
-    return {"description": description.model_dump(mode="json"), "variant": variant, "versions": versions}
 
 
 def _render_shard(job: _Job, report: Callable[[None], None]) -> None:
