@@ -3,9 +3,6 @@
 Ratios to them hold on other machines, also on busy ones.
 """
 
-import os
-import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -122,9 +119,3 @@ def connected_parts_seconds(image: np.ndarray) -> float:
         cv2.connectedComponentsWithStats(parts)
 
     return median_seconds(label, runs=15)
-
-
-def python_seconds(code: str) -> float:
-    """Median seconds of a Python process that runs ``code``."""
-    command = [sys.executable, "-c", code]
-    return median_seconds(lambda k: subprocess.run(command, check=True, capture_output=True, env=dict(os.environ)))

@@ -65,7 +65,7 @@ def test_a_disagreement_is_reported(study, thesis):
             error_mm=np.zeros(5),
             line_mm=np.full(5, 120.0),
             exposure_ms=1.0,
-            seconds={"render": 1.0},
+            seconds=1.0,
         )
         return compare_scatter(study, candidate("thesis", -1, thesis), rendered)
 

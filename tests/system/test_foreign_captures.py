@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.system.in_process import uwlts
 from tests.uwlts.calibration_views import lattice, stage_images
 from tests.uwlts.drawn_stripes import SPHERES, STAGE_MM, coarse_sensor, sphere_profiles, step_image, stripe_image, write
 from tests.uwlts.drawn_target import drawn_lamp, drawn_laser
@@ -181,41 +182,6 @@ def test_images_with_a_hole(says, scan_images, tmp_path: Path, suffix: str):
     )
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (turned, "512 x 640 pixels; expected 640 x 512 .* rotated by 90 deg: rotate them back"),
-        (lambda image: cv2.resize(image, (320, 256)), "320 x 256 pixels; expected 640 x 512"),
-        (black, "all 5 laser images are black, no pixel reaches 2 % of full scale: is the laser on"),
-        (white, "laser0.png is white: 100 % of its pixels are saturated"),
-    ],
-    ids=["turned", "small", "black", "white"],
-)
-def test_images_that_are_all_wrong(says, scan_images, tmp_path: Path, change, words: str):
-    folder = folder_of(tmp_path / "images", [change(image) for image in scan_images[:5]])
-    says(f"import {folder} --out {tmp_path / 'x.h5'}", words)
-
-
-@pytest.mark.parametrize(
-    ("change", "size", "words"),
-    [
-        (noise, (640, 512), "no stripe in any of the 5 laser images: check which images are laser images"),
-        (turned_square, (512, 512), "no stripe in any of the 5 laser images: in 5 of them one runs across"),
-    ],
-    ids=["noise", "turned"],
-)
-def test_images_without_a_stripe_are_imported_with_a_warning(
-    scan_images, tmp_path: Path, monkeypatch, capfd, change, size, words
-):
-    folder = folder_of(tmp_path / "images", [change(image) for image in scan_images[:5]], size=size)
-    monkeypatch.setattr("sys.argv", ["uwlts", "import", str(folder), "--out", str(tmp_path / "x.h5")])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    _, err = capfd.readouterr()
-    assert ended.value.code == 0 and len(err.strip().splitlines()) == 1
-    assert re.match(f"warning: {words}", err), err
-
-
 # --- Captures of the target
 
 TARGETS: dict[str, tuple[Damage, str]] = {
@@ -252,13 +218,11 @@ def test_captures_of_the_target(says, target_frames, tmp_path: Path, name: str):
     says(f"calibrate --air {path} --out {tmp_path / 'x.json'}", words)
 
 
-def test_the_target_as_it_should_be_calibrates(target_frames, tmp_path: Path, monkeypatch, capfd):
+def test_the_target_as_it_should_be_calibrates(target_frames, tmp_path: Path):
     """The same images undamaged, as a control for the refusals."""
     path = captured(tmp_path / "x.h5", target_frames, target=PLATE)
-    monkeypatch.setattr("sys.argv", ["uwlts", "calibrate", "--air", str(path), "--out", str(tmp_path / "x.json")])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    assert (ended.value.code, capfd.readouterr().err) == (0, "")
+    ended = uwlts("calibrate", "--air", path, "--out", tmp_path / "x.json")
+    assert (ended.returncode, ended.stderr) == (0, "")
 
 
 @pytest.mark.parametrize("name", ["black", "switched", "laser off", "stripe across"])
@@ -333,16 +297,11 @@ def test_scans_of_another_size(says, scan_images, calibration, tmp_path: Path):
     says(f"reconstruct {small} {line}", "640 x 256 pixels, .* 640 x 512: calibrate with images of this size")
 
 
-def test_a_scan_upside_down_gives_hollow_spheres(says, scan_images, calibration, tmp_path: Path, monkeypatch):
+def test_a_scan_upside_down_gives_hollow_spheres(says, scan_images, calibration, tmp_path: Path):
     turned_over = [np.ascontiguousarray(upside_down(image)) for image in scan_images]
     scan = write(tmp_path / "scan.h5", turned_over, stage_mm=STAGE_MM, artefact=SPHERES)
     cloud = tmp_path / "scan.ply"
-    monkeypatch.setattr(
-        "sys.argv", ["uwlts", "reconstruct", str(scan), "--calibration", str(calibration), "--out", str(cloud)]
-    )
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    assert ended.value.code == 0
+    assert uwlts("reconstruct", scan, "--calibration", calibration, "--out", cloud).returncode == 0
     says(f"evaluate {cloud} --out {tmp_path / 'x.json'}", "hollow: .* rotated by 180 deg or mirrored")
 
 

@@ -209,48 +209,22 @@ def test_studies_without_an_answer_say_so(study, tmp_path, change, says):
 @contextmanager
 def cluster(folder: Path, workers: int) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
     """A Dask scheduler and workers, processes of their own on loopback: its address, and the workers."""
-    found = folder / "scheduler.json"
-    module = [sys.executable, "-m"]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": folder}
-    scheduler = subprocess.Popen(
-        [
-            *module,
-            "distributed.cli.dask_scheduler",
-            "--host",
-            "127.0.0.1",
-            "--port",
-            "0",
-            "--no-dashboard",
-            "--scheduler-file",
-            str(found),
-        ],
-        **quiet,
-    )
-    processes: list[subprocess.Popen[bytes]] = []
+    found, processes = folder / "scheduler.json", []
+
+    def start(program: str, *words: str) -> None:
+        line = [sys.executable, "-m", f"distributed.cli.{program}", "--host", "127.0.0.1", "--no-dashboard", *words]
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": folder}
+        processes.append(subprocess.Popen([*line, "--scheduler-file", str(found)], **quiet))
+
     try:
+        start("dask_scheduler", "--port", "0")
         # The file is there before its text is.
         until(lambda: found.is_file() and found.read_text().endswith("}"))
-        processes += [
-            subprocess.Popen(
-                [
-                    *module,
-                    "distributed.cli.dask_worker",
-                    "--scheduler-file",
-                    str(found),
-                    "--host",
-                    "127.0.0.1",
-                    "--nthreads",
-                    "1",
-                    "--no-nanny",
-                    "--no-dashboard",
-                ],
-                **quiet,
-            )
-            for _ in range(workers)
-        ]
-        yield json.loads(found.read_text())["address"], processes
+        for _ in range(workers):
+            start("dask_worker", "--nthreads", "1", "--no-nanny")
+        yield json.loads(found.read_text())["address"], processes[1:]
     finally:
-        for process in (*processes, scheduler):
+        for process in reversed(processes):
             process.kill()
             process.wait()
 

@@ -175,13 +175,11 @@ def test_impossible_designs_are_refused_before_anything_is_rendered(thesis, tmp_
     assert not (tmp_path / "none").exists()
 
 
-def test_unknown_media_reflectances_and_no_workers_are_refused(thesis, tmp_path):
+def test_unknown_media_and_reflectances_are_refused(thesis, tmp_path):
     with pytest.raises(DescriptionError, match="knows the media air, water"):
         verify(thesis, "oil", tmp_path)
     with pytest.raises(DescriptionError, match="reflectance"):
         verify(thesis, "water", tmp_path, reflectance=1.5)
-    with pytest.raises(DescriptionError, match="workers is 0"):
-        verify(thesis, "water", tmp_path, workers=0)
 
 
 def test_the_softwares_complaint_becomes_an_error(tmp_path):
@@ -245,5 +243,4 @@ def test_the_thesiss_sensor_measures_a_plane_in_water(thesis, tmp_path):
     assert calibration["camera"]["fx_px"] == pytest.approx(thesis.camera.focal_length_px(), rel=1e-3)
     assert residuals["camera"]["images"] == TARGET_POSES and calibration["provenance"]["warnings"] == []
     assert 0 < found.exposure_ms < thesis.exposure.longest_ms
-    assert set(found.seconds) == {"render", "calibrate", "measure"}
-    assert [path.name for path in tmp_path.iterdir()] == ["calibration.json"]
+    assert found.seconds > 0

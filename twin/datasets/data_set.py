@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from enum import IntEnum, IntFlag
 from pathlib import Path
 from typing import Annotated, Literal, Self
@@ -20,9 +19,7 @@ from uwlts.model.library import find_description, load_sensor, read_table, valid
 from uwlts.model.sensor import Description, Positive, Sensor
 
 FOLDER = "datasets"
-ROOTS = ("sensor", "as_built", "scene", "effects")
-"""First keys of paths that vary between scenes; only `EXPOSURE` varies between frames."""
-EXPOSURE = "frame.exposure"
+EXPOSURE = "frame.exposure"  # path that varies between frames; all others vary between scenes
 _ONE_FOR_ALL = ("camera.width_px", "camera.height_px", "camera.stripe_along", "detector.bits", "motion.count")
 _PRINT_ERRORS = ("centre_std_mm", "stretch", "bow_mm", "detection_std_px")
 Label = Literal["centre", "quality", "points", "masks", "light", "depth", "target", "sensor"]
@@ -65,16 +62,8 @@ FAINT_BELOW = 3.0
 detection requires 5 to 6 (A. Rose, J. Opt. Soc. Am. 38, 196, 1948)."""
 
 
-class Distribution(Description, ABC):
-    """Base of all distributions; `quantile` is the inverse of the cumulative distribution function."""
-
-    @abstractmethod
-    def quantile(self, share: float) -> Value:
-        """Return the quantile of a probability from 0 to 1."""
-
-
-class Constant(Distribution):
-    """Constant value."""
+class Constant(Description):
+    """Constant value. The ``quantile`` of a distribution is the inverse of its cumulative distribution function."""
 
     kind: Literal["constant"]
     value: Value
@@ -84,7 +73,7 @@ class Constant(Distribution):
         return self.value
 
 
-class OneOf(Distribution):
+class OneOf(Description):
     """One of several values, with probabilities proportional to ``weights``, by default equal."""
 
     kind: Literal["choice"]
@@ -108,7 +97,7 @@ class OneOf(Distribution):
         return self.values[-1]
 
 
-class Between(Distribution):
+class Between(Description):
     """Base of distributions on a range."""
 
     least: float
@@ -147,7 +136,7 @@ class LogUniform(Between):
         return self.least * (self.most / self.least) ** share
 
 
-class Normal(Distribution):
+class Normal(Description):
     """Normal distribution, truncated to ``least`` and ``most`` if they are given."""
 
     kind: Literal["normal"]
@@ -303,21 +292,16 @@ class DataSetDescription(Description):
         root, _, rest = path.partition(".")
         if path == EXPOSURE:
             return 1.0
-        match root:
-            case "sensor":
-                return value_at(self.sensor, rest, f"vary '{path}'")
-            case "as_built":
-                return value_at(self.as_built or self.sensor, rest, f"vary '{path}'")
-            case "scene":
-                return value_at(self.scene, rest, f"vary '{path}'", called="scene")
-            case "effects":
-                strength = getattr(Flaws.parse(rest), rest.replace("-", "_"))
-                if isinstance(strength, bool):
-                    raise DescriptionError(f"vary '{path}': {rest} does not have a strength; name it in effects")
-                return strength
-            case _:
-                known = ", ".join(f"{each}." for each in ROOTS)
-                raise DescriptionError(f"vary '{path}': a path begins with {known} or is {EXPOSURE}")
+        described = {"sensor": self.sensor, "as_built": self.as_built or self.sensor, "scene": self.scene}
+        if root in described:
+            return value_at(described[root], rest, f"vary '{path}'", called="scene" if root == "scene" else "sensor")
+        if root != "effects":
+            known = ", ".join(f"{each}." for each in (*described, "effects"))
+            raise DescriptionError(f"vary '{path}': a path begins with {known} or is {EXPOSURE}")
+        strength = getattr(Flaws.parse(rest), rest.replace("-", "_"))
+        if isinstance(strength, bool):
+            raise DescriptionError(f"vary '{path}': {rest} does not have a strength; name it in effects")
+        return strength
 
 
 def load_description(

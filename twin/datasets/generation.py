@@ -14,10 +14,10 @@ import random
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from pydantic import JsonValue
@@ -54,18 +54,10 @@ if TYPE_CHECKING:
     from twin.recording.sensor_simulator import SensorSimulator, SimulatedImage
     from twin.scene.platforms import Shot
 
+Described = TypeVar("Described", Sensor, Scene)
+
 _BRIGHT = 0.03
 """Largest fraction of pixels at the maximum without a warning; a stripe of 20 px with all its pixels there has 2 %."""
-
-
-@dataclass
-class _Collected:
-    """Statistics of all frames; their memory does not grow with the size of the images."""
-
-    drawn: dict[str, list[Value]] = field(default_factory=dict)
-    status: Counter[int] = field(default_factory=Counter)
-    redrawn: set[int] = field(default_factory=set)
-    bright: int = 0
 
 
 def write_card(
@@ -97,39 +89,37 @@ def write_card(
         description=description.model_dump(mode="json"),
         shards=tuple(Shard(name=path.name, split=own, frames=n, sha256=hash_file(path)) for path, own, n in shards),
     )
-    found = _collect_statistics(DataSet(folder, card, None, ("info", "status")))
+    values: dict[str, list[Value]] = {}
+    status: Counter[int] = Counter()
+    redrawn: set[int] = set()
+    bright = 0
+    for sample in DataSet(folder, card, None, ("info", "status")):
+        info = sample["info"]
+        bright += info.get("at_maximum", 0.0) > _BRIGHT
+        for path, value in info["drawn"].items():
+            # Values that all frames of a scene share count once.
+            if info["frame"] == 0 or path == EXPOSURE:
+                values.setdefault(path, []).append(value)
+        if info["attempt"]:
+            redrawn.add(info["scene"])
+        if "status" in sample:
+            numbers, counts = np.unique(sample["status"], return_counts=True)
+            status.update(dict(zip(numbers.tolist(), counts.tolist(), strict=True)))
     names = [name for name in DataSet(folder, card, None, None)[0] if name in MEANINGS]
     card = card.model_copy(
         update={
-            "redrawn": len(found.redrawn),
+            "redrawn": len(redrawn),
             "labels": {name: MEANINGS[name] for name in names},
-            "drawn": {path: _summary(values) for path, values in found.drawn.items()},
-            "status": {LineStatus(number).name.lower(): count for number, count in sorted(found.status.items())},
+            "drawn": {path: _summary(drawn) for path, drawn in values.items()},
+            "status": {LineStatus(number).name.lower(): count for number, count in sorted(status.items())},
         }
     )
-    if found.bright:
-        said = f"{found.bright} of {sum(frames.values())} images have more than {100 * _BRIGHT:g} % of their pixels"
+    if bright:
+        said = f"{bright} of {sum(frames.values())} images have more than {100 * _BRIGHT:g} % of their pixels"
         log_warnings(folder, [f"{said} at the maximum: lower exposure.auto_level, frame.exposure or the ambient light"])
     # The last file: with it the data set is complete.
     write_model(folder / CARD, card, file_format=CARD_FORMAT, version=CARD_VERSION, overwrite=True)
     return card
-
-
-def _collect_statistics(samples: DataSet) -> _Collected:
-    found = _Collected()
-    for sample in samples:
-        info = sample["info"]
-        found.bright += info.get("at_maximum", 0.0) > _BRIGHT
-        for path, value in info["drawn"].items():
-            # Values that all frames of a scene share count once.
-            if info["frame"] == 0 or path == "frame.exposure":
-                found.drawn.setdefault(path, []).append(value)
-        if info["attempt"]:
-            found.redrawn.add(info["scene"])
-        if "status" in sample:
-            numbers, counts = np.unique(sample["status"], return_counts=True)
-            found.status.update(dict(zip(numbers.tolist(), counts.tolist(), strict=True)))
-    return found
 
 
 def _summary(values: Sequence[Value]) -> dict[str, float | str]:
@@ -137,9 +127,6 @@ def _summary(values: Sequence[Value]) -> dict[str, float | str]:
         return {str(value): float(count) for value, count in sorted(Counter(map(str, values)).items())}
     numbers = np.array(values, float)
     return {"least": float(numbers.min()), "mean": float(numbers.mean()), "most": float(numbers.max())}
-
-
-# --- the data card ----------------------------------------------------------------------------------------------------
 
 
 _GOLDEN = (5**0.5 - 1) / 2
@@ -183,7 +170,6 @@ def draw_scene(description: DataSetDescription, scene: int, *, attempt: int = 0)
     def share(path: str, frame: int = 0) -> float:
         return float(np.random.default_rng([description.seed, scene, attempt, frame, *path.encode()]).random())
 
-    motion = description.scene.motion
     values = {path: description.draw_value(path, share(path)) for path in description.vary if path != EXPOSURE}
     by_root: dict[str, dict[str, Value]] = {"sensor": {}, "as_built": {}, "scene": {}, "effects": {}}
     for path, value in values.items():
@@ -194,19 +180,13 @@ def draw_scene(description: DataSetDescription, scene: int, *, attempt: int = 0)
         described = _apply_values(description.sensor, by_root["sensor"], source)
         as_built = _apply_values(description.as_built or description.sensor, by_root["sensor"], source)
         as_built = _apply_values(as_built, by_root["as_built"], source)
-        table = description.scene.model_dump()
-        drawn = (
-            validate_description(Scene, with_values(table, by_root["scene"]), source)
-            if by_root["scene"]
-            else description.scene
-        )
+        drawn = _apply_values(description.scene, by_root["scene"], source)
         seed = int(np.random.SeedSequence([description.seed, scene, attempt]).generate_state(1)[0])
         options = description.options(seed=seed, strengths=by_root["effects"])
     except Error as error:
         text = ", ".join(f"{path} = {value}" for path, value in values.items())
         raise type(error)(f"{error}\n  drawn: {text}; narrow the distributions of these paths in vary") from error
-    motion = drawn.motion
-    exposures = (1.0,) * motion.images()
+    exposures = (1.0,) * drawn.motion.images()
     if EXPOSURE in description.vary:
         exposures = tuple(float(description.draw_value(EXPOSURE, share(EXPOSURE, k))) for k in range(len(exposures)))
     return DrawnScene(
@@ -214,8 +194,9 @@ def draw_scene(description: DataSetDescription, scene: int, *, attempt: int = 0)
     )
 
 
-def _apply_values(sensor: Sensor, values: dict[str, Value], source: str) -> Sensor:
-    return validate_description(Sensor, with_values(sensor.model_dump(), values), source) if values else sensor
+def _apply_values(described: Described, values: dict[str, Value], source: str) -> Described:
+    table = with_values(described.model_dump(), values)
+    return validate_description(type(described), table, source) if values else described
 
 
 MOST_ATTEMPTS = 20
@@ -284,7 +265,8 @@ def dataset(
     described, folder = load_description(description, scenes=scenes, seed=seed), Path(out)
     draw_scene(described, 0)
     jobs = _jobs(described, folder, variant)
-    plan = _plan(described, variant)
+    versions: dict[str, JsonValue] = {package: version(package) for package in ("uwlts", "mitsuba", "drjit")}
+    plan = {"description": described.model_dump(mode="json"), "variant": variant, "versions": versions}
     make_folder(folder)
     if overwrite and (folder / PLAN).is_file():
         for path in folder.iterdir():
@@ -345,22 +327,12 @@ def _jobs(description: DataSetDescription, folder: Path, variant: str) -> list[_
     return sorted(jobs, key=lambda job: job.scenes)
 
 
-def _plan(description: DataSetDescription, variant: str) -> dict[str, JsonValue]:
-    """Return the settings that determine the frames."""
-    versions: dict[str, JsonValue] = {package: version(package) for package in ("uwlts", "mitsuba", "drjit")}
-    return {"description": description.model_dump(mode="json"), "variant": variant, "versions": versions}
-
-
 def _render_shard(job: _Job, report: Callable[[None], None]) -> None:
     """Render the scenes of a shard to its file, unless another run has done so, and call ``report`` for each frame."""
-    if not job.path.is_file():
-        _render(job, report)
+    if job.path.is_file():
+        for _ in range(job.frames):
+            report(None)
         return
-    for _ in range(job.frames):
-        report(None)
-
-
-def _render(job: _Job, report: Callable[[None], None]) -> None:
     use_variant(job.variant)
     import drjit as dr
     import mitsuba as mi
@@ -415,7 +387,7 @@ def _make_frame_metadata(
         "stage_mm": shot.stage_mm,
         "exposure_ms": taken.exposure_ms,
         "at_maximum": float((taken.image >= studio.sensor.detector.full_scale_dn()).mean()),
-        "drawn": drawn.values | {"frame.exposure": drawn.exposures[index]},
+        "drawn": drawn.values | {EXPOSURE: drawn.exposures[index]},
         "T_scene_object": studio.pose(shot).tolist(),
         "T_camera_object": camera_from_object(studio.sensor).tolist(),
     }

@@ -7,7 +7,6 @@ sheet, the labels belong to the brightest.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -102,11 +101,10 @@ def _line_labels(
     direct, total, noise, clipped = (each if camera.stripe_along == "width" else each.T for each in images)
     quality = stripe_quality(direct, noise, truth.centre_px, informative=total < detector.full_well_e, clipped=clipped)
     lit = np.isfinite(truth.centre_px)
-    status[lit] = np.where(quality.snr[lit] >= FAINT_BELOW, LineStatus.VISIBLE, LineStatus.FAINT)
-    status[quality.clipped] = LineStatus.SATURATED
-    floats = {"centre_px": truth.centre_px, "point_mm": truth.point_mm, "normal": truth.normal}
-    floats |= {"width_px": quality.width_px, "snr": quality.snr, "bound_px": quality.bound_px}
-    floats |= {name: getattr(truth, name) for name in ("centroid_px", "visible_fraction", "mixed_fraction")}
+    status[lit] = np.where(quality["snr"][lit] >= FAINT_BELOW, LineStatus.VISIBLE, LineStatus.FAINT)
+    status[quality.pop("clipped")] = LineStatus.SATURATED
+    of_truth = ("centre_px", "point_mm", "normal", "centroid_px", "visible_fraction", "mixed_fraction")
+    floats = quality | {name: getattr(truth, name) for name in of_truth}
     return {name: values.astype(np.float32) for name, values in floats.items()} | {"status": status, "object": number}
 
 
@@ -131,24 +129,13 @@ def noise_std_e(taken: SimulatedImage, detector: Detector) -> np.ndarray:
     return np.sqrt(taken.total() + np.float32(constant))
 
 
-@dataclass(frozen=True)
-class LineQuality:
-    """Quality of the stripe on L profile lines: width, signal-to-noise ratio and Cramér-Rao bound of its centre, (L,).
-
-    ``clipped`` (L,) marks stripes with saturated pixels within the full width at half maximum. Values are NaN without a
-    stripe.
-    """
-
-    width_px: np.ndarray
-    snr: np.ndarray
-    bound_px: np.ndarray
-    clipped: np.ndarray
-
-
 def stripe_quality(
     direct: np.ndarray, noise: np.ndarray, centre: np.ndarray, *, informative: np.ndarray, clipped: np.ndarray
-) -> LineQuality:
-    """Evaluate the stripe at true centres.
+) -> dict[str, np.ndarray]:
+    """Evaluate the stripe at true centres of L profile lines; NaN without a stripe.
+
+    Returns "width_px", "snr", "bound_px" (L,), and "clipped" (L,): stripes with saturated pixels within the full width
+    at half maximum.
 
     The stripe is the run of lit pixels that contains the centre. Its width is the full width at half maximum, with
     linear interpolation between pixels; NaN if the stripe is cut by the image's border. The bound is the Cramér-Rao
@@ -203,10 +190,11 @@ def stripe_quality(
         everywhere[lines] = values
         return everywhere
 
-    return LineQuality(
-        *(of_all_lines(values, np.nan) for values in (width, snr, bound)),
-        clipped=of_all_lines((within & np.take(clipped, pixel) & (half > 0)).any(axis=0), False),
-    )
+    saturated = (within & np.take(clipped, pixel) & (half > 0)).any(axis=0)
+    found = {"width_px": width, "snr": snr, "bound_px": bound}
+    return {name: of_all_lines(values, np.nan) for name, values in found.items()} | {
+        "clipped": of_all_lines(saturated, False)
+    }
 
 
 def make_mask(taken: SimulatedImage, noise: np.ndarray, *, saturation: int, along_width: bool) -> np.ndarray:

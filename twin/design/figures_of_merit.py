@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cache, partial
+from functools import cache
 from types import ModuleType
 from typing import Any
 
@@ -437,15 +437,10 @@ def _freeze(follow: tuple[Follow, ...], reflectance: float) -> Callable[..., Any
     return dr.freeze(lambda given, *at: evaluate_volume(dr, SensorArrays(**given), follow, reflectance, *at))
 
 
-def _each(values: Array, designs: int) -> np.ndarray:
-    """Return one number (N,) for each design."""
-    return np.broadcast_to(np.asarray(values, dtype=float).reshape(-1), (designs,)).copy()
-
-
 def _reduce_fields(p: SensorArrays, f: dict[str, np.ndarray], share: np.ndarray, *, water_depth_m: float) -> Figures:
     """Return the figures of N designs from their fields (N, DEPTHS, PLACES) and the fraction of the depth in view."""
     n, middle, inside = len(f["z_mm"]), DEPTHS // 2, f["lit"] > 0
-    one = partial(_each, designs=n)
+    one = p.each
 
     def worst(name: str) -> np.ndarray:
         return np.where(inside, f[name], -np.inf).max(axis=(1, 2))
@@ -487,8 +482,7 @@ def _reduce_fields(p: SensorArrays, f: dict[str, np.ndarray], share: np.ndarray,
 
 def _reasons(p: SensorArrays, figures: Figures, f: dict[str, np.ndarray]) -> list[str]:
     """Return for each of N designs the first reason why it cannot work, "" if it works."""
-    n = len(figures.coverage)
-    one = partial(_each, designs=n)
+    one = p.each
     corner = np.hypot(p.width_px, p.height_px / p.pixel_aspect) / 2 * p.pixel_mm / p.focal_mm
     glass = corner / snell_root(np, p.window_index, corner)
     cone = one(2 * (corner * p.window_distance_mm + p.window_thickness_mm * glass) + p.focal_mm / p.f_number)
@@ -521,7 +515,7 @@ def _reasons(p: SensorArrays, figures: Figures, f: dict[str, np.ndarray]) -> lis
         "the stripe's image is nearly independent of depth, or runs along the other side of the image: "
         "turn the camera or the laser": (~(flat < 0.5 * figures.standoff_mm)),
     }
-    reasons = [""] * n
+    reasons = [""] * len(figures.coverage)
     for text, failed in checks.items():
         for i in np.flatnonzero(failed):
             reasons[i] = reasons[i] or text.format(**{name: values[i] for name, values in numbers.items()})

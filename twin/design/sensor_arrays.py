@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from operator import attrgetter
 from types import ModuleType
 from typing import Literal
 
@@ -144,6 +145,10 @@ class SensorArrays:
 
         return SensorArrays(**{name: taken(values) for name, values in vars(self).items()})
 
+    def each(self, values: Array) -> np.ndarray:
+        """Return one number (N,) for each design."""
+        return np.broadcast_to(np.asarray(values, dtype=float).reshape(-1), (self.baseline_mm.size,)).copy()
+
     def pose(self, xp: ModuleType) -> LaserFan:
         """Return the laser's fan in the camera frame."""
         towards = (1.0 - self.along_width, -self.along_width, 0.0 * self.along_width)
@@ -276,35 +281,28 @@ def extract_numbers(sensor: Sensor, medium: Medium) -> SensorArrays:
     table = laser.fan_table()
     half = math.radians(laser.fan_angle_deg / 2)
     lit = (-half, half) if not table else (math.radians(table[0][0]), math.radians(table[-1][0]))
-    angle, speckle = laser.triangulation_angle_deg, 1.0
+    speckle = 1.0
     if (width := laser.linewidth_nm) > 0:
         # Reduction of contrast on a diffuse surface by the line width.
         speckle = coherence(_DIFFUSE_ROUGHNESS_UM, linewidth_nm=width, wavelength_nm=wavelength, index=index)
+    applicable = list_independent_paths(sensor)
     numbers = {
-        "baseline_mm": math.nan if by_axis or laser.baseline_mm is None else laser.baseline_mm,
-        "angle_rad": math.nan if by_axis or angle is None else math.radians(angle),
-        "roll_rad": math.radians(laser.roll_deg),
+        column: unit * attrgetter(path)(sensor) if path in applicable else math.nan
+        for path, (column, unit) in PARAMETER_OF.items()
+    }
+    numbers |= {
         "along_width": float(camera.stripe_along == "width"),
         "width_px": camera.width_px,
         "height_px": camera.height_px,
         "pixel_mm": 1e-3 * camera.pixel_size_um,
         "pixel_aspect": camera.pixel_aspect,
-        "focal_mm": camera.focal_length_mm,
-        "f_number": camera.f_number,
-        "focus_mm": camera.focus_distance_mm,
         "window_mounted": float(window.mounted),
-        "window_tilt_x_rad": math.radians(window.tilt_x_deg),
-        "window_tilt_y_rad": math.radians(window.tilt_y_deg),
         "wavelength_mm": 1e-6 * wavelength,
-        "power_w": 1e-3 * laser.power_mw,
         "fan_half_rad": half,
         "lit_from_rad": lit[0],
         "lit_to_rad": lit[1],
         "gaussian_fan": float(laser.fan_profile == "gaussian"),
         "tabulated_fan": float(bool(table)),
-        "waist_mm": laser.waist_radius_mm,
-        "waist_distance_mm": laser.waist_distance_mm,
-        "beam_quality": laser.beam_quality_m2,
         "medium_index": index,
         "extinction_per_mm": medium.extinction_per_mm(wavelength),
         "scattering_per_mm": medium.scattering_per_mm(wavelength),
@@ -322,16 +320,12 @@ def extract_numbers(sensor: Sensor, medium: Medium) -> SensorArrays:
         "speckle_coherence": speckle,
         "stage_resolution_mm": sensor.stage.resolution_mm,
         "window_strength_mpa": window.strength_mpa() or FUSED_SILICA_MPA,
-        "near_mm": sensor.volume.near_mm,
-        "far_mm": sensor.volume.far_mm,
     }
     for name, one in (("window", window), ("laser_window", laser.window)):
         glass = one.index(wavelength) if one.mounted else 1.0
         # Transmittance of both faces at normal incidence (Fresnel).
         faces = (1 - ((glass - 1) / (glass + 1)) ** 2) * (1 - ((glass - index) / (glass + index)) ** 2)
         numbers |= {
-            f"{name}_distance_mm": one.distance_mm,
-            f"{name}_thickness_mm": one.thickness_mm,
             f"{name}_index": glass,
             f"{name}_faces_pass": faces,
             f"{name}_absorption_per_mm": one.absorption_per_mm() if one.mounted else 0.0,

@@ -26,7 +26,7 @@ from optuna.distributions import BaseDistribution, CategoricalDistribution, Floa
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import Trial, TrialState
-from pydantic import JsonValue, TypeAdapter
+from pydantic import TypeAdapter
 
 from twin.design.choice import StudyResults, choose
 from twin.design.designs import (
@@ -38,9 +38,9 @@ from twin.design.designs import (
     make_failed_columns,
     sample_designs,
 )
-from twin.design.report.study_page import page_text
-from twin.design.report.study_tables import failure_counts
 from twin.design.study import Study, load_study
+from twin.design.study_page import page_text
+from twin.design.study_tables import failure_counts
 from twin.design.verification import Agreement, verify_candidates
 from twin.recording.campaigns import PLAN, keep_to_plan, make_folder, require_at_least
 from twin.rendering_options import CPU, Variant
@@ -157,8 +157,11 @@ def evaluate_study(
     the workers' cluster does not respond.
     """
     make_folder(folder)
+    plan = study.model_dump(mode="json", exclude=set(_FREE_TO_CHANGE))
+    del plan["sampling"]["designs"]
+    plan |= {"sensor": study.sensor.model_dump(mode="json")}
     # Hidden files are temporary files of a stopped sweep.
-    keep_to_plan(folder, _plan(study), set(), recorded="[!.]*", called="files", overwrite=False)
+    keep_to_plan(folder, plan, set(), recorded="[!.]*", called="files", overwrite=False)
     place, total = make_folder(folder / PARTS), count_designs(study)
 
     def write(evaluated: tuple[Batch, bytes | Lost]) -> None:
@@ -235,13 +238,6 @@ def _report(search: optuna.Study, study: Study, columns: Columns) -> None:
             search.tell(trial.number, values)
         else:
             search.tell(trial.number, state=TrialState.FAIL)
-
-
-def _plan(study: Study) -> dict[str, JsonValue]:
-    """Return the settings that determine the results of a study."""
-    plan = study.model_dump(mode="json", exclude=set(_FREE_TO_CHANGE))
-    del plan["sampling"]["designs"]
-    return plan | {"sensor": study.sensor.model_dump(mode="json")}
 
 
 JOURNAL = "optimiser.log"

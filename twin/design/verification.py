@@ -27,7 +27,7 @@ from twin.design.sensor_arrays import extract_parameters
 from twin.design.study import Study
 from twin.design.verification_scenes import PlannedRecording, plan_recordings
 from twin.experiments.runner import run_apart
-from twin.recording.campaigns import make_folder, record_on_one_thread, require_at_least
+from twin.recording.campaigns import make_folder, record_on_one_thread
 from twin.rendering_options import CPU, Options
 from uwlts import errors
 from uwlts.errors import Error
@@ -35,9 +35,8 @@ from uwlts.files.writing import write_atomically
 from uwlts.model.sensor import Sensor
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.runtime.workers import Lost, Workers, run_jobs
-from uwlts.storage.capture import Capture, part_path
+from uwlts.storage.capture import Capture
 from uwlts.storage.cloud_files import read_cloud
-from uwlts.storage.truth import truth_path
 
 _USER_ERROR = 2  # exit code of the commands for a mistake of the user
 _FEWEST_POINTS = 20  # of a profile, for its scatter to be known within a sixth
@@ -62,7 +61,7 @@ class VerifiedMeasurements:
     OCS's origin, which is equal at all depths."""
     line_mm: np.ndarray  # (K,); length of the profile along Y
     exposure_ms: float = math.nan  # exposure of the plane's images
-    seconds: dict[str, float] = field(default_factory=dict)  # times to render, calibrate and measure
+    seconds: float = math.nan  # time to render, calibrate and measure
 
 
 def verify(
@@ -77,73 +76,36 @@ def verify(
 ) -> VerifiedMeasurements:
     """Calibrate a sensor and measure a plane with it in one of its media, with rendered images.
 
-    Equal arguments give equal results.
+    Equal arguments give equal results. ``folder`` is empty and receives captures, calibration and cloud.
+    ``reflectance`` is that of the plane, ``seed`` that of the noise, ``variant`` one of Mitsuba. With one of
+    ``workers``, images are rendered in this process, else in as many.
 
-    Parameters
-    ----------
-    sensor : Sensor
-        Sensor to verify.
-    medium : str
-        Name of one of the sensor's media.
-    folder : Path
-        Folder of the files. Files of an earlier run are replaced; the calibration is kept.
-    reflectance : float
-        Reflectance of the plane.
-    seed : int
-        Seed of the noise.
-    variant : str
-        Mitsuba variant.
-    workers : int
-        Number of processes; with 1, images are rendered in this process.
-
-    Raises
-    ------
-    DescriptionError, DesignError
-        The sensor cannot work in the medium, or cannot be calibrated.
-    CalibrationError, CaptureError
-        The sensor software cannot calibrate, or does not find the stripe; with its message.
-    EvaluationError
-        The cloud has too few points at every depth.
-    OutputError
-        A file cannot be written.
-    SetupError
-        A process was ended from outside, or the machine cannot render.
+    Raises DescriptionError or DesignError if the sensor cannot work in the medium, or cannot be calibrated;
+    CalibrationError or CaptureError if the software cannot calibrate, or does not find the stripe; EvaluationError if
+    the cloud has too few points at every depth; OutputError if a file cannot be written; SetupError if a process was
+    ended from outside, or the machine cannot render.
     """
-    require_at_least(1, workers=workers)
     planned = plan_recordings(sensor, medium, reflectance=reflectance)
     calibration, cloud = folder / "calibration.json", folder / "standard.ply"
     make_folder(folder)
-    try:
-        calibration.unlink(missing_ok=True)  # a calibration of an earlier run must not be used
-    except OSError as error:
-        raise errors.OutputError(f"cannot replace {calibration}: {error.strerror}") from error
     # Each recording has its own seed, so that the noise is independent.
     jobs = [
         (recording, Options(seed=int(np.random.SeedSequence([seed, k]).generate_state(1)[0])))
-        for k, recording in enumerate(planned.all())
+        for k, recording in enumerate(planned)
+        if recording is not None
     ]
-    times = [time.perf_counter()]
-    try:
-        run_jobs(partial(_record, folder, variant), jobs, workers=min(workers, len(jobs)))
-        times.append(time.perf_counter())
-        steps = [] if planned.step is None else ["--step", str(_capture(folder, planned.step))]
-        target = str(_capture(folder, planned.target))
-        _run("calibrate", "--air", target, *steps, "--out", str(calibration), fails_as=errors.CalibrationError)
-        times.append(time.perf_counter())
-        capture = _capture(folder, planned.standard)
-        known = ("--calibration", str(calibration), "--out", str(cloud))
-        _run("reconstruct", str(capture), *known, fails_as=errors.CaptureError)
-        with Capture(capture) as opened:
-            exposure, stage = float(opened.exposure_ms[0]), np.array(opened.stage_mm)
-        found = read_cloud(cloud)
-        profiles = _evaluate_points(np.column_stack([found.frame, found.points_mm[:, 1:]]), stage)
-        times.append(time.perf_counter())
-    finally:
-        captures = [_capture(folder, recording) for recording in planned.all()]
-        for path in (cloud, *captures, *map(truth_path, captures), *map(part_path, captures)):
-            path.unlink(missing_ok=True)
-    seconds = dict(zip(("render", "calibrate", "measure"), np.diff(times).tolist(), strict=True))
-    return replace(profiles, exposure_ms=exposure, seconds=seconds)
+    start = time.perf_counter()
+    run_jobs(partial(_record, folder, variant), jobs, workers=min(workers, len(jobs)))
+    steps = [] if planned.step is None else ["--step", str(_capture(folder, planned.step))]
+    target, capture = (str(_capture(folder, recording)) for recording in (planned.target, planned.standard))
+    _run("calibrate", "--air", target, *steps, "--out", str(calibration), fails_as=errors.CalibrationError)
+    known = ("--calibration", str(calibration), "--out", str(cloud))
+    _run("reconstruct", capture, *known, fails_as=errors.CaptureError)
+    with Capture(capture) as opened:
+        exposure, stage = float(opened.exposure_ms[0]), np.array(opened.stage_mm)
+    found = read_cloud(cloud)
+    profiles = _evaluate_points(np.column_stack([found.frame, found.points_mm[:, 1:]]), stage)
+    return replace(profiles, exposure_ms=exposure, seconds=time.perf_counter() - start)
 
 
 def _capture(folder: Path, recording: PlannedRecording) -> Path:
@@ -187,8 +149,7 @@ def _evaluate_points(points: np.ndarray, stage_mm: np.ndarray) -> VerifiedMeasur
         )
     nothing = (math.nan, math.nan, 0.0)
     figures = np.array([_profile(p) if good else nothing for p, good in zip(found, enough, strict=True)])
-    scatter, error, line = figures.T
-    return VerifiedMeasurements(-stage_mm[order], np.array([len(profile) for profile in found]), scatter, error, line)
+    return VerifiedMeasurements(-stage_mm[order], np.array([*map(len, found)]), *figures.T)
 
 
 def _profile(points_yz: np.ndarray) -> tuple[float, float, float]:
@@ -276,7 +237,7 @@ def compare_scatter(study: Study, candidate: HighlightedDesign, rendered: Verifi
         agrees=bool(factor <= study.verify_tolerance),
         exposure_ms=rendered.exposure_ms,
         predicted_exposure_ms=figures.exposure_ms.item(),
-        seconds=sum(rendered.seconds.values()),
+        seconds=rendered.seconds,
     )
 
 

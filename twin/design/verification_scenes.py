@@ -6,6 +6,7 @@ along Z, so that each image shows the object at another depth.
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -71,7 +72,7 @@ class LineOfSight:
 
     def line_mm(self, z: float) -> np.ndarray:
         """Return Y values, closely spaced, of the visible line at ``z``; can be empty."""
-        reach = self.depth_mm(z) * self._diagonal_slope()
+        reach = 2 * self.depth_mm(z) * self.camera.corner_slope()
         middle = -self.pose[:3, 1] @ (self.pose[:3, 3] + self.pose[:3, 2] * z)
         y = np.linspace(middle - reach, middle + reach, 1001)
         visible = self.in_image(np.column_stack([np.zeros_like(y), y, np.full_like(y, z)]))
@@ -94,10 +95,7 @@ class LineOfSight:
         length = np.full(len(rays), 1e6)
         np.divide(z - pupil[2], rays[:, 2], out=length, where=rays[:, 2] > 1e-6)
         hits = np.abs(pupil[:2] + length[:, None] * rays[:, :2] - (0.0, y))
-        return np.minimum(hits.max(axis=0), 1.25 * self.depth_mm(z) * self._diagonal_slope() / 2)
-
-    def _diagonal_slope(self) -> float:
-        return 2 * self.camera.corner_slope()
+        return np.minimum(hits.max(axis=0), 1.25 * self.depth_mm(z) * self.camera.corner_slope())
 
 
 def find_longest_run(flags: np.ndarray | list[bool]) -> slice:
@@ -139,17 +137,12 @@ class PlannedRecording:
     scene: Scene
 
 
-@dataclass(frozen=True)
-class Recordings:
-    """Recordings of a verification; a sensor without refraction does not need the step standard."""
+class Recordings(NamedTuple):
+    """Recordings of a verification, sorted by number of images; without refraction, no step standard is needed."""
 
     target: PlannedRecording
-    step: PlannedRecording | None
     standard: PlannedRecording
-
-    def all(self) -> list[PlannedRecording]:
-        """Return all recordings, sorted by decreasing number of images."""
-        return [recording for recording in (self.target, self.standard, self.step) if recording is not None]
+    step: PlannedRecording | None
 
 
 def plan_recordings(sensor: Sensor, medium: str, *, reflectance: float) -> Recordings:
@@ -176,7 +169,7 @@ def plan_recordings(sensor: Sensor, medium: str, *, reflectance: float) -> Recor
     exposed = Exposure.model_validate(sensor.exposure.model_dump() | {"laser_ms": "auto", "lamp_ms": "auto"})
     calibrated = sensor.model_copy(update={"exposure": exposed})
     if not (sensor.camera.window.mounted and sight.index > 1 + 1e-6):
-        return Recordings(_target(calibrated, medium, sight, near=near, far=far, y=y), None, standard)
+        return Recordings(_target(calibrated, medium, sight, near=near, far=far, y=y), standard, None)
     step = PlannedRecording("step", calibrated, _step(medium, near=near, far=far, y=y, length=length))
     wavelength, media = sensor.laser.wavelength_nm, dict(sensor.media)
     air = next(
@@ -189,7 +182,7 @@ def plan_recordings(sensor: Sensor, medium: str, *, reflectance: float) -> Recor
     window = in_air.camera.window.model_copy(update={"mounted": False})
     camera = in_air.camera.model_copy(update={"window": window})
     bare = LineOfSight.from_sensor(in_air.model_copy(update={"camera": camera}), in_air.medium(air))
-    return Recordings(_target(in_air, air, bare, near=near, far=far, y=y), step, standard)
+    return Recordings(_target(in_air, air, bare, near=near, far=far, y=y), standard, step)
 
 
 def find_measured_range(sensor: Sensor, medium: Medium) -> tuple[float, float]:

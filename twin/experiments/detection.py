@@ -35,7 +35,21 @@ _SLOPES = (-1.0, 5.0)
 _SIGNAL_VALUES = ("undercut left", "undercut right")
 
 
-class ProbabilityOfDetection(BaseModel, frozen=True):
+class Fitted(BaseModel, frozen=True):
+    """Fitted probability of detection.
+
+    The parameters of the curve are, for hits and misses, the logarithm of the depth in mm with 50 % and the inverse
+    slope of the logistic; for a signal response, the depth with 50 % and the standard deviation of a normal
+    distribution, in mm.
+    """
+
+    a90_mm: float | None = None  # depth found with a probability of 90 %; None if the flaws do not determine it
+    a90_95_mm: float | None = None  # its upper bound with 95 % confidence; None if the flaws do not bound it
+    location: float | None = None
+    scale: float | None = None
+
+
+class ProbabilityOfDetection(Fitted, frozen=True):
     """Probability of detection of one kind of flaw against its depth."""
 
     flaw: Flaw  # "pit", "dent" or "undercut"
@@ -47,12 +61,6 @@ class ProbabilityOfDetection(BaseModel, frozen=True):
     signals_mm: tuple[float, ...] | None = None
     """Measured depths of a signal response, 0 where nothing was measured; None for hits and misses."""
     false_calls: int = 0  # findings that are no flaw
-    a90_mm: float | None = None  # depth found with a probability of 90 %; None if the flaws do not determine it
-    a90_95_mm: float | None = None  # its upper bound with 95 % confidence; None if the flaws do not bound it
-    # Parameters of the curve. Hit or miss: logarithm of the depth in mm with 50 %, and inverse slope of the logistic.
-    # Signal response: depth with 50 % and standard deviation of a normal distribution, in mm.
-    location: float | None = None
-    scale: float | None = None
 
     def probability(self, depth_mm: np.ndarray) -> np.ndarray:
         """Return the probability of detection (K,) at depths (K,) in mm; NaN if it is not determined."""
@@ -73,16 +81,6 @@ class ProbabilityOfDetection(BaseModel, frozen=True):
         if self.method == "signal response" and (false := float(self.probability(np.zeros(1))[0])) > 1 - _ONE_SIDED:
             found.append(f"false calls with {100 * false:.0f} % probability")
         return "; ".join(found)
-
-
-@dataclass(frozen=True)
-class Fitted:
-    """Fitted probability of detection; see `ProbabilityOfDetection`."""
-
-    a90_mm: float | None = None
-    a90_95_mm: float | None = None
-    location: float | None = None
-    scale: float | None = None
 
 
 def fit_hit_miss(depth_mm: np.ndarray, found: np.ndarray) -> Fitted:
@@ -121,7 +119,8 @@ def fit_hit_miss(depth_mm: np.ndarray, found: np.ndarray) -> Fitted:
         crossing = optimize.root_scalar(lambda at: best_slope(at)[0] - limit, bracket=(at_90, ends[1]), xtol=1e-4)
         bound = math.exp(crossing.root)
     slope = best_slope(at_90)[1]
-    return Fitted(math.exp(at_90), bound, at_90 - odds / slope, 1 / slope)
+    at_50 = at_90 - odds / slope
+    return Fitted(a90_mm=math.exp(at_90), a90_95_mm=bound, location=at_50, scale=1 / slope)
 
 
 def _minimise(of: Callable[[float], float], ends: tuple[float, float]) -> tuple[float, float]:
@@ -170,7 +169,7 @@ def fit_signal_response(depth_mm: np.ndarray, signal_mm: np.ndarray, *, threshol
     except np.linalg.LinAlgError:
         variance = math.nan
     bound = a90 + float(stats.norm.ppf(_ONE_SIDED)) * math.sqrt(variance) if variance > 0 else None
-    return Fitted(a90, bound, float(location), float(scale))
+    return Fitted(a90_mm=a90, a90_95_mm=bound, location=location, scale=scale)
 
 
 _TIGHT = {"xatol": 1e-7, "fatol": 1e-9, "maxiter": 4000}
@@ -221,7 +220,7 @@ class FlawFindings:
             found=tuple(self.found),
             signals_mm=tuple(self.signals_mm) if self.flaw == "undercut" else None,
             false_calls=self.false_calls,
-            **vars(fitted),
+            **fitted.model_dump(),
         )
 
 

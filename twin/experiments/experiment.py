@@ -12,7 +12,7 @@ from twin.experiments.result import ExperimentResult
 from twin.experiments.runner import COLOURED, Method, evidence_of, inspected_as, is_evaluated, plan_lines, run_stages
 from twin.recording.campaigns import RecordingOptions, make_folder, record_campaigns, require_at_least
 from twin.rendering_options import CPU, Variant
-from twin.scene.campaign import Campaign, CampaignRecording, find_understated, list_takes, load_campaign
+from twin.scene.campaign import Campaign, find_understated, list_takes, load_campaign
 from uwlts.errors import DescriptionError, DescriptionWarning
 from uwlts.files.writing import write_atomically
 from uwlts.model.library import validate_description
@@ -107,7 +107,11 @@ def experiment(
     folder = Path(
         out or Path("runs") / f"experiment-{sensor.name if isinstance(sensor, Sensor) else Path(sensor).stem}"
     )
-    evidence = [each for each in described.recordings if _is_evidence(described, each)]
+    evidence = [
+        each
+        for each in described.recordings
+        if any(map(evidence_of, list_takes(described.model_copy(update={"recordings": (each,)}), seed=0)))
+    ]
     scans = [each if isinstance(each, dict) else {"scene": str(each)} for each in scenes]
     changes: dict[str, Any] = {
         "sensor": _name_of(sensor, folder / "sensor.toml"),
@@ -272,12 +276,6 @@ def choose_joint(campaign: Campaign, every: int, *, all_scans: bool) -> Method:
     if not scans:
         raise DescriptionError(f"campaign {campaign.title!r} has no scan of an artefact, a pitted pipe or a weld")
     return Method(JOINT, evidence, scans)
-
-
-def _is_evidence(campaign: Campaign, recording: CampaignRecording) -> bool:
-    """Return whether a recording of a campaign is one for its calibration."""
-    alone = campaign.model_copy(update={"recordings": (recording,)})
-    return any(evidence_of(take) is not None for take in list_takes(alone, seed=0))
 
 
 def _name_of(sensor: str | Path | Sensor, path: Path) -> str:

@@ -9,7 +9,7 @@ import runpy
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -79,16 +79,16 @@ class Method:
 
 @dataclass(frozen=True)
 class CommandLine:
-    """Command line of a stage, with the files that it reads and the one that it writes; without one, it always runs."""
+    """Command line of a stage, with the files that it reads and the one that it writes."""
 
     stage: str
     text: str
     reads: tuple[Path, ...]
-    writes: Path | None
+    writes: Path
 
     def is_done(self) -> bool:
         """Return whether the output is there and no older than the inputs."""
-        if self.writes is None or not self.writes.is_file():
+        if not self.writes.is_file():
             return False
         made = self.writes.stat().st_mtime_ns
         return all(path.stat().st_mtime_ns <= made for path in self.reads)
@@ -123,65 +123,42 @@ def plan_lines(
     ``with_truth`` compares all clouds with the ground truth of their recordings, too. With ``coloured``, those of the
     first method are also written with the colours of their deviations.
     """
-    made = {method.calibration(folder): _calibrate(folder, method) for method in methods}
-    lines = [*made.values()]
+    lines: dict[Path, CommandLine] = {}
     for method in methods:
+        made = method.calibration(folder)
+        words = (*_give(folder, method.evidence), *shlex.split(method.options), "--out", made)
+        lines[made] = _line("calibrate", made, method.command, *words)
+    for method in methods:
+        calibration = method.calibration(folder)
         if any(method.thesis.values()):
-            lines.append(_summarize(folder, method))
+            made = method.result(folder, THESIS, "json")
+            lines[made] = _line("evaluate", made, "thesis", calibration, *_give(folder, method.thesis), "--out", made)
         for scan in method.scans:
-            shown = coloured and method is methods[0]
-            lines += _measure(folder, method, takes[scan], with_truth=with_truth, coloured=shown)
-    return sorted(lines, key=lambda line: ("calibrate", "reconstruct", "evaluate").index(line.stage))
+            capture, cloud = folder / f"{scan}.h5", method.result(folder, scan, "cloud.h5")
+            words = (capture, "--calibration", calibration, "--out", cloud, *shlex.split(method.detection))
+            lines[cloud] = _line("reconstruct", cloud, "reconstruct", *words)
+            if with_truth or is_evaluated(takes[scan].scene):
+                made = method.result(folder, scan, "evaluation.json")
+                compared = ["--truth", str(capture.with_suffix(".truth.h5"))] if with_truth else []
+                if with_truth and coloured and method is methods[0]:
+                    compared += ["--coloured", str(method.result(folder, scan, COLOURED))]
+                lines[made] = _line("evaluate", made, "evaluate", cloud, "--out", made, *compared)
+            if method.inspected and (kind := inspected_as(takes[scan].scene)) is not None:
+                made = method.result(folder, scan, "inspection.json")
+                lines[made] = _line("evaluate", made, "inspect", cloud, kind, "--out", made)
+    return sorted(lines.values(), key=lambda line: ("calibrate", "reconstruct", "evaluate").index(line.stage))
 
 
-def _calibrate(folder: Path, method: Method) -> CommandLine:
-    words, reads = _give(folder, method.evidence)
-    more = f" {method.options}" if method.options else ""
-    made = method.calibration(folder)
-    text = f"uwlts {method.command} {words}{more} --out {_quoted(made)} --overwrite"
-    return CommandLine("calibrate", text, reads, made)
+def _line(stage: str, writes: Path, *words: str | Path) -> CommandLine:
+    """Return the command line of some words; it reads the paths among them that it does not write."""
+    text = shlex.join(["uwlts", *map(str, words), "--overwrite"])
+    return CommandLine(stage, text, tuple(one for one in words if isinstance(one, Path) and one != writes), writes)
 
 
-def _summarize(folder: Path, method: Method) -> CommandLine:
-    """Return the command of the figures that follow from several recordings."""
-    words, reads = _give(folder, method.thesis)
-    calibration, made = method.calibration(folder), method.result(folder, THESIS, "json")
-    text = f"uwlts thesis {_quoted(calibration)} {words} --out {_quoted(made)} --overwrite"
-    return CommandLine("evaluate", text, (calibration, *reads), made)
-
-
-def _give(folder: Path, recordings: Mapping[str, Sequence[str]]) -> tuple[str, tuple[Path, ...]]:
-    """Return the words that give recordings by options, and their paths."""
+def _give(folder: Path, recordings: Mapping[str, Sequence[str]]) -> list[str | Path]:
+    """Return the words that give recordings by options."""
     given = {option: [folder / f"{name}.h5" for name in names] for option, names in recordings.items() if names}
-    words = " ".join(f"--{option} {' '.join(map(_quoted, paths))}" for option, paths in given.items())
-    return words, tuple(path for paths in given.values() for path in paths)
-
-
-def _measure(folder: Path, method: Method, take: Take, *, with_truth: bool, coloured: bool) -> Iterator[CommandLine]:
-    capture, calibration = folder / f"{take.name}.h5", method.calibration(folder)
-    cloud = method.result(folder, take.name, "cloud.h5")
-    known = f"--calibration {_quoted(calibration)} --out {_quoted(cloud)}"
-    known += f" {method.detection}" if method.detection else ""
-    yield CommandLine(
-        "reconstruct", f"uwlts reconstruct {_quoted(capture)} {known} --overwrite", (capture, calibration), cloud
-    )
-    if with_truth or is_evaluated(take.scene):
-        made, words = method.result(folder, take.name, "evaluation.json"), ""
-        if with_truth:
-            words += f" --truth {_quoted(capture.with_suffix('.truth.h5'))}"
-        if with_truth and coloured:
-            words += f" --coloured {_quoted(method.result(folder, take.name, COLOURED))}"
-        text = f"uwlts evaluate {_quoted(cloud)} --out {_quoted(made)}{words} --overwrite"
-        yield CommandLine("evaluate", text, (cloud,), made)
-    if method.inspected and (kind := inspected_as(take.scene)) is not None:
-        made = method.result(folder, take.name, "inspection.json")
-        yield CommandLine(
-            "evaluate", f"uwlts inspect {_quoted(cloud)} {kind} --out {_quoted(made)} --overwrite", (cloud,), made
-        )
-
-
-def _quoted(path: Path) -> str:
-    return shlex.quote(str(path))
+    return [word for option, paths in given.items() for word in (f"--{option}", *paths)]
 
 
 def run_stages(
@@ -239,9 +216,3 @@ def run_apart(line: str) -> tuple[int, str]:
     words = [sys.executable, "-m", *shlex.split(line)]
     done = subprocess.run(words, check=False, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     return done.returncode, done.stdout
-
-
-def run_program(*words: str) -> None:
-    """Run a program as ``python -m`` does, with its output on the terminal; CommandFailed if it fails."""
-    if code := subprocess.run([sys.executable, "-m", *words], check=False).returncode:
-        raise CommandFailed(" ".join(words[:2]), code)

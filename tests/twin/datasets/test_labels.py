@@ -44,23 +44,25 @@ def test_width_noise_and_bound_of_a_gaussian_stripe(sigma):
     found = stripe_quality(signal, noise, centres, informative=everywhere, clipped=~everywhere)
     # A pixel adds a twelfth to the variance. Between two pixels the peak is exp(-1 / (8 sigma^2)) of its height, 12 %
     # less at 1 px, and the half of it farther out.
-    np.testing.assert_allclose(found.width_px, 2.3548 * np.hypot(sigma, 12**-0.5), rtol=0.1 / sigma)
-    np.testing.assert_allclose(found.snr, signal.max(axis=0) / np.sqrt(signal.max(axis=0) + 400.0), rtol=1e-5)
+    np.testing.assert_allclose(found["width_px"], 2.3548 * np.hypot(sigma, 12**-0.5), rtol=0.1 / sigma)
+    np.testing.assert_allclose(found["snr"], signal.max(axis=0) / np.sqrt(signal.max(axis=0) + 400.0), rtol=1e-5)
     step = 1e-4
     slopes = [
         (gaussian(c + step, sigma, count, 5e3) - gaussian(c - step, sigma, count, 5e3)) / (2 * step) for c in centres
     ]
     bound = 1 / np.sqrt((np.square(np.stack(slopes, axis=1)) / np.square(noise)).sum(axis=0))
     # Five points determine the slope of a Gaussian of 1 px to some percent.
-    np.testing.assert_allclose(found.bound_px, bound, rtol=0.06 if sigma < 1.5 else 0.01)
-    assert not found.clipped.any()
+    np.testing.assert_allclose(found["bound_px"], bound, rtol=0.06 if sigma < 1.5 else 0.01)
+    assert not found["clipped"].any()
 
 
 def test_least_squares_reach_the_bound():
     sigma, count, centre, runs = 1.7, 40, 20.3, 600
     signal = gaussian(centre, sigma, count, 3000.0)[:, None].astype(np.float32)
     noise, everywhere = np.sqrt(signal + 900.0), np.ones(signal.shape, bool)
-    bound = stripe_quality(signal, noise, np.array([centre]), informative=everywhere, clipped=~everywhere).bound_px[0]
+    bound = stripe_quality(signal, noise, np.array([centre]), informative=everywhere, clipped=~everywhere)["bound_px"][
+        0
+    ]
     rng = np.random.default_rng(5)
     found = []
     for _ in range(runs):
@@ -79,12 +81,12 @@ def test_stripes_cut_by_the_image_and_lines_without_one_have_no_width():
     noise, everywhere = np.sqrt(signal + 100.0), np.ones(signal.shape, bool)
     clipped = signal > 900
     found = stripe_quality(signal, noise, np.array([0.5, 20.3, np.nan]), informative=everywhere, clipped=clipped)
-    assert np.isnan(found.width_px).tolist() == [True, False, True]
-    assert np.isnan(found.snr).tolist() == [False, False, True]
-    assert found.clipped.tolist() == [True, True, False]
+    assert np.isnan(found["width_px"]).tolist() == [True, False, True]
+    assert np.isnan(found["snr"]).tolist() == [False, False, True]
+    assert found["clipped"].tolist() == [True, True, False]
     # Clipped pixels contain no information: here they are the flat top, and the bound grows.
     less = stripe_quality(signal, noise, np.array([0.5, 20.3, np.nan]), informative=~clipped, clipped=clipped)
-    assert less.bound_px[1] > found.bound_px[1]
+    assert less["bound_px"][1] > found["bound_px"][1]
 
 
 def test_centres_are_where_light_of_least_time_shows_the_sheet(thesis):

@@ -1,6 +1,5 @@
 """Descriptions of studies, and their designs."""
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +18,8 @@ from twin.design.designs import (
     select_design,
 )
 from twin.design.figures_of_merit import FIGURES, RENDERED_SCATTERING_DEPTH
-from twin.design.report.study_tables import format_design_value
 from twin.design.study import Study, load_study
+from twin.design.study_tables import format_design_value
 from twin.design.sweep import encode_part, read_parts, write_csv, write_part
 from uwlts.errors import CaptureError, DescriptionError, DesignError
 from uwlts.model.library import list_names, load_sensor
@@ -294,9 +293,3 @@ def test_a_damaged_part_is_named(study, tmp_path):
 
 def test_no_parts_are_no_columns(tmp_path):
     assert read_parts(tmp_path) == {}
-    assert math.isnan(
-        evaluate_designs(
-            load_study(written(tmp_path)),
-            [Design(0, {BASELINE: -1.0, "camera.window.glass": "N-BK7", "camera": "small"})],
-        )["line_mm"].item()
-    )

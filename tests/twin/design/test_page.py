@@ -16,14 +16,17 @@ from twin.design.designs import (
     EvaluatedDesign,
     HighlightedDesign,
     build_sensor,
+    count_designs,
     evaluate_designs,
     evaluate_sensor,
+    sample_designs,
     select_design,
 )
+from twin.design.drawing import make_view
 from twin.design.figures_of_merit import FIGURES
-from twin.design.report.drawing import make_view
-from twin.design.report.study_page import choose_pareto_axes, figures_chart, page_text, pareto_chart, sample
-from twin.design.report.study_tables import (
+from twin.design.study import Study, load_study
+from twin.design.study_page import choose_pareto_axes, figures_chart, page_text, pareto_chart, sample
+from twin.design.study_tables import (
     agreement_text,
     label_of,
     misses,
@@ -33,7 +36,6 @@ from twin.design.report.study_tables import (
     without_numbers,
     words_of,
 )
-from twin.design.study import Study, load_study
 from twin.design.verification import Agreement
 from uwlts.errors import EvaluationError
 from uwlts.model.sensor import Sensor
@@ -57,19 +59,7 @@ def small(**changes) -> Study:
 
 
 def grid(study: Study) -> tuple[list[Design], dict[str, np.ndarray]]:
-    names, grids = list(study.free()), [variable.grid() for variable in study.free().values()]
-    mesh = np.stack(np.meshgrid(*(np.arange(len(g)) for g in grids), indexing="ij"), -1).reshape(-1, len(grids))
-    designs = [
-        Design(number, {n: g[k] for n, g, k in zip(names, grids, row, strict=True)})
-        for number, row in enumerate(mesh.tolist())
-    ]
-    return designs, evaluate_designs(study, designs)
-
-
-def scattered(study: Study, count: int) -> tuple[list[Design], dict[str, np.ndarray]]:
-    rng = np.random.default_rng(5)
-    rows = zip(*(v.values_at(rng.random(count)) for v in study.free().values()), strict=True)
-    designs = [Design(k, dict(zip(study.free(), row, strict=True))) for k, row in enumerate(rows)]
+    designs = sample_designs(study, 0, count_designs(study))
     return designs, evaluate_designs(study, designs)
 
 
@@ -454,10 +444,9 @@ def test_a_page_where_nothing_meets_the_constraints():
     assert len(page.figures) == 2
 
 
-@pytest.mark.parametrize("kind", ["grid", "scattered"])
-def test_a_page_of_one_design(kind):
+def test_a_page_of_one_design():
     study = small()
-    designs, columns = grid(study) if kind == "grid" else scattered(study, 40)
+    designs, columns = grid(study)
     place = int(np.flatnonzero(columns["violation"] == 0)[0])
     one = {name: values[place : place + 1] for name, values in columns.items()}
     marked = [HighlightedDesign("only", build_sensor(study, designs[place]), select_design(columns, place))]

@@ -1,4 +1,7 @@
-"""Sensor and scene descriptions: all shipped ones are valid, and every mistake is rejected with its name."""
+"""Scene descriptions: all shipped ones are valid, and every mistake is rejected with its name.
+
+Those of sensors are tested in `tests.uwlts.model.test_library`.
+"""
 
 import numpy as np
 import pytest
@@ -12,11 +15,9 @@ from twin.scene.description import Scene, load_scene, medium_of
 from twin.scene.objects import Objects, build_objects
 from twin.scene.platforms import Motion
 from twin.scene.scene_object import Pose
-from uwlts.errors import DescriptionError, RangeError
+from uwlts.errors import DescriptionError
 from uwlts.model.library import library_folder, list_names, load_sensor
-from uwlts.model.sensor import Sensor
 
-SENSORS = list_names("sensors")
 PLACES = [(scene, place) for scene in list_names() for place in load_scene(scene).placements]
 
 
@@ -25,16 +26,8 @@ def built(scene: Scene) -> Objects:
 
 
 def test_the_library_is_not_empty():
-    assert {"thesis", "thesis-as-built"} <= set(SENSORS)
     assert {"plane", "spheres", "step", "pipe", "head", "weld", "target"} <= set(list_names())
     assert len(PLACES) > 15
-
-
-@pytest.mark.parametrize("name", SENSORS)
-def test_every_shipped_sensor_loads(name):
-    sensor = load_sensor(name)
-    assert sensor.name == name
-    assert {"air", "water"} <= set(sensor.media)
 
 
 @pytest.mark.parametrize(("name", "place"), PLACES)
@@ -55,62 +48,6 @@ def written(folder, text: str, *, name: str = "sensor.toml"):
     return path
 
 
-# Mistake, and expected part of the message.
-BAD_SENSORS = {
-    "unknown key": ("[camera]\nfocal_lenght_mm = 12.5", r"camera\.focal_lenght_mm: unknown key"),
-    "wrong unit": ("[laser]\nbaseline_m = 0.265", r"laser\.baseline_m: unknown key.*unit"),
-    "unknown table": ("[lens]\nk1 = 0.1", r"lens: unknown key"),
-    "not a number": ("[camera]\nfocal_length_mm = nan", r"camera\.focal_length_mm: .*finite.*nan"),
-    "infinite": ("[stage]\ntravel_mm = inf", r"stage\.travel_mm: .*finite.*inf"),
-    "text for a number": ("[laser]\npower_mw = 'strong'", r"laser\.power_mw: .*'strong'"),
-    "negative": ("[laser]\nfan_angle_deg = -45.0", r"laser\.fan_angle_deg: .*-45"),
-    "zero pixels": ("[camera]\nwidth_px = 0", r"camera\.width_px: .*found 0"),
-    "half a pixel": ("[camera]\nwidth_px = 100.5", r"camera\.width_px: .*100\.5"),
-    "unknown glass": ("[camera.window]\nglass = 'N-BK8'", r"unknown glass 'N-BK8'; known are N-BK7"),
-    "glass of air": ("[camera.window]\nglass = 1.0", r"camera\.window\.glass"),
-    "stripe": ("[camera]\nstripe_along = 'depth'", r"camera\.stripe_along: .*'depth'"),
-    "bits": ("[detector]\nbits = 9", r"detector\.bits: .*found 9"),
-    "placed twice": (
-        "[laser]\norigin_mm = [0.0, -265.0, 0.0]\naxis = [0.0, 0.6, 0.8]\nbaseline_mm = 265.0",
-        r"laser: place the laser by baseline_mm",
-    ),
-    "placed half": ("[laser]\naxis = [0.0, 0.6, 0.8]", r"laser: place the laser by baseline_mm"),
-    "custom without index": ("[media.oil]\nkind = 'custom'", r"media\.oil: a custom medium needs its index"),
-    "salty fresh water": ("[media.lake]\nkind = 'fresh'\nsalinity_g_kg = 3.0", r"media\.lake: .*salinity 3 g/kg"),
-    "unknown kind": ("[media.oil]\nkind = 'oil'", r"media\.oil\.kind: .*'oil'"),
-    "volume": ("[volume]\nnear_mm = 500.0", r"volume: near_mm 500 must be smaller than far_mm 420"),
-}
-
-
-@pytest.mark.parametrize("mistake", BAD_SENSORS)
-def test_a_mistake_in_a_sensor_is_refused_by_name(tmp_path, mistake):
-    text, message = BAD_SENSORS[mistake]
-    path = written(tmp_path, "base = 'thesis'\n" + text)
-    with pytest.raises(DescriptionError, match=message) as refusal:
-        load_sensor(path)
-    assert str(path) in str(refusal.value)
-
-
-def test_all_mistakes_are_named_at_once(tmp_path):
-    path = written(tmp_path, "base = 'thesis'\n[laser]\nbaseline_m = 0.2\npower_mw = -1.0\n[detector]\nbits = 16")
-    with pytest.raises(DescriptionError) as refusal:
-        load_sensor(path)
-    assert all(key in str(refusal.value) for key in ("laser.baseline_m", "laser.power_mw", "detector.bits"))
-
-
-@pytest.mark.parametrize("degrees", [-1.0, 30.5, 80.0])
-def test_water_outside_quan_and_frys_temperatures_is_refused(tmp_path, degrees):
-    path = written(tmp_path, f"base = 'thesis'\n[media.water]\ntemperature_c = {degrees}")
-    with pytest.raises(RangeError, match=rf"temperature_c is {degrees:g}, but .*Quan and Fry.* from 0 to 30"):
-        load_sensor(path)
-
-
-def test_a_missing_key_is_refused_by_name(tmp_path):
-    text = (library_folder() / "sensors" / "thesis.toml").read_text(encoding="utf-8").replace("f_number = 4.0", "")
-    with pytest.raises(DescriptionError, match=r"camera\.f_number: missing"):
-        load_sensor(written(tmp_path, text))
-
-
 def test_a_laser_may_be_placed_by_origin_and_axis_instead(tmp_path, thesis):
     text = (library_folder() / "sensors" / "thesis.toml").read_text(encoding="utf-8")
     placed = text.replace("baseline_mm = 265.0", "origin_mm = [0.0, -265.0, 0.0]")
@@ -123,45 +60,12 @@ def test_a_laser_may_be_placed_by_origin_and_axis_instead(tmp_path, thesis):
     )
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [("base = 'nobody'", "nothing is called 'nobody'; known are .*thesis"), ("name = ", "not valid TOML")],
-)
-def test_what_cannot_be_read_is_refused(tmp_path, text, message):
-    with pytest.raises(DescriptionError, match=message):
-        load_sensor(written(tmp_path, text))
-
-
-def test_a_missing_file_or_name_is_refused(tmp_path):
-    with pytest.raises(DescriptionError, match=r"no description at .*absent\.toml"):
-        load_sensor(tmp_path / "absent.toml")
-    with pytest.raises(DescriptionError, match="nothing is called 'theses'; known are thesis, thesis-as-built"):
-        load_sensor("theses")
-    with pytest.raises(DescriptionError, match="nothing is called 'ball'; known are .*spheres"):
-        load_scene("ball")
-
-
-def test_bases_that_lead_back_to_themselves_are_refused(tmp_path):
-    written(tmp_path, "base = 'b'", name="a.toml")
-    written(tmp_path, "base = 'c'", name="b.toml")
-    path = written(tmp_path, "base = 'a'", name="c.toml")
-    with pytest.raises(DescriptionError, match=r"its own base: c\.toml -> a\.toml -> b\.toml -> c\.toml"):
-        load_sensor(path)
-
-
-def test_a_base_gives_what_a_description_leaves_out(tmp_path):
-    first = written(tmp_path, "base = 'thesis'\nname = 'mine'\n[laser]\npower_mw = 20.0", name="mine.toml")
-    second = written(tmp_path, "base = 'mine'\n[laser.window]\nglass = 'N-BK7'", name="other.toml")
-    thesis, mine, other = load_sensor("thesis"), load_sensor(first), load_sensor(second)
-    assert (mine.laser.power_mw, mine.laser.window) == (20.0, thesis.laser.window)
-    assert (other.laser.power_mw, other.laser.window.glass, other.camera) == (20.0, "N-BK7", thesis.camera)
-
-
 PLATE = "title = 't'\n[[objects]]\nkind = 'plate'\nwidth_mm = 5.0\nheight_mm = 5.0\n"
 BLOCK = "title = 't'\n[[objects]]\nkind = 'block'\nsize_mm = [10.0, 10.0, 10.0]\n"
 HEAD = "title = 't'\n[[objects]]\nkind = 'head'\n"
 WELD = "title = 't'\n[[objects]]\nkind = 'weld'\n"
 
+# Mistake, and expected part of the message.
 BAD_SCENES = {
     "no objects": ("title = 't'\nobjects = []", r"objects: .*at least 1"),
     "objects as a table": ("title = 't'\n[objects]\nkind = 'plate'", r"\[\[objects\]\]"),
@@ -346,6 +250,5 @@ def test_a_scan_takes_its_lights_in_turn_at_every_position():
 def test_descriptions_are_frozen_and_survive_json(thesis):
     with pytest.raises(ValueError, match="frozen"):
         thesis.name = "other"
-    assert Sensor.model_validate_json(thesis.model_dump_json()) == thesis
     scene = load_scene("target")
     assert Scene.model_validate_json(scene.model_dump_json()) == scene

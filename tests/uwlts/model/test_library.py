@@ -38,7 +38,8 @@ def test_every_shipped_sensor_is_valid():
     shipped = list_names("sensors")
     assert {"thesis", "thesis-as-built"} <= set(shipped)
     for name in shipped:
-        assert load_sensor(name).name == name
+        sensor = load_sensor(name)
+        assert sensor.name == name and {"air", "water"} <= set(sensor.media)
         assert find_description(name, "sensors") == library_folder() / "sensors" / f"{name}.toml"
 
 
@@ -143,7 +144,11 @@ def test_unknown_base(tmp_path: Path):
         ("[camera]\nfocal_length_mm = '12.5 mm'\n", ("camera.focal_length_mm", "12.5 mm")),
         ("[camera]\nstripe_along = 'diagonal'\n", ("camera.stripe_along", "'width' or 'height'", "diagonal")),
         ("camera = 3\n", ("camera", "found 3")),
-        ("[camera.window]\nglass = 'cheese'\n", ("a.toml", "cheese")),
+        ("[camera.window]\nglass = 'cheese'\n", ("unknown glass 'cheese'; known are N-BK7",)),
+        ("[camera.window]\nglass = 1.0\n", ("camera.window.glass",)),
+        ("[laser]\nfan_angle_deg = -45.0\n", ("laser.fan_angle_deg", "-45")),
+        ("[detector]\nbits = 9\n", ("detector.bits", "found 9")),
+        ("[media.lake]\nkind = 'fresh'\nsalinity_g_kg = 3.0\n", ("media.lake", "salinity 3 g/kg")),
         ("[laser]\naxis = [0, 0, 1]\n", ("laser: place the laser by",)),
         ("[volume]\nnear_mm = 500\n", ("volume: near_mm 500 must be smaller than far_mm 420",)),
         ("[media.brine]\nkind = 'custom'\n", ("media.brine: a custom medium needs its index",)),
@@ -162,9 +167,10 @@ def test_all_wrong_keys_are_reported_at_once(tmp_path: Path):
     assert "speed: unknown key" in message
 
 
-def test_formula_out_of_its_range_names_the_file(tmp_path: Path):
-    path = written(tmp_path / "a.toml", 'base = "thesis"\n[media.soup]\nkind = "fresh"\ntemperature_c = 99.0\n')
-    with pytest.raises(RangeError, match=r"a\.toml.*99"):
+@pytest.mark.parametrize("degrees", [-1.0, 30.5, 99.0])
+def test_formula_out_of_its_range_names_the_file(tmp_path: Path, degrees: float):
+    path = written(tmp_path / "a.toml", f'base = "thesis"\n[media.water]\ntemperature_c = {degrees}\n')
+    with pytest.raises(RangeError, match=rf"a\.toml.*temperature_c is {degrees:g}, but .*Quan and Fry.* from 0 to 30"):
         load_sensor(path)
 
 

@@ -5,28 +5,12 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from scipy.special import erf
 
+from tests.uwlts.stripe.test_stripe import LENGTH, gaussian, grey, phases, position_bound
 from uwlts.cli.command_options import MethodName
 from uwlts.stripe import StripeOptions, StripeStatus, extract_stripe, method_names
 
-LENGTH = 120
 FIT = "profile-fit"
-
-
-def gaussian(centre, *, sigma, amplitude):
-    """Return (L, LENGTH) Gaussian stripes integrated over the pixels."""
-    x = np.arange(LENGTH) - np.asarray(centre, float)[:, None]
-    cumulative = erf((x + 0.5) / (sigma * math.sqrt(2))) - erf((x - 0.5) / (sigma * math.sqrt(2)))
-    return amplitude * sigma * math.sqrt(math.pi / 2) * cumulative
-
-
-def phases(count=128):
-    return LENGTH / 2 + (np.arange(count) + 0.5) / count
-
-
-def grey(values):
-    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
 def centres(image, method=FIT):
@@ -45,7 +29,7 @@ def test_it_is_the_default_and_the_command_knows_all_methods():
 )
 @pytest.mark.parametrize("slope", [-0.1, 0.0, 0.1])
 def test_unbiased_over_phase_width_and_background(sigma, limit, slope):
-    centre = phases()
+    centre = phases(128)
     profile = gaussian(centre, sigma=sigma, amplitude=150) + 30 + slope * np.arange(LENGTH)
     error = centres(profile.astype(np.float32)) - centre
     # Sigma 0.45: without the mean of the Gaussian over the pixel, the error would be 0.008 px. Sigma 4: the
@@ -59,30 +43,13 @@ def test_unbiased_over_phase_width_and_background(sigma, limit, slope):
 
 @pytest.mark.parametrize(("sigma", "over"), [(1.0, 1.5), (2.0, 2.0), (2.0, 5.0), (3.0, 4.0)])
 def test_saturation(sigma, over):
-    centre = phases()
+    centre = phases(128)
     image = grey(gaussian(centre, sigma=sigma, amplitude=255 * over) + 20)
     assert (np.count_nonzero(image == 255, axis=1) >= 2).mean() > 0.5
     error = centres(image) - centre
     # The flanks determine the position of a clipped stripe: half the largest error of the zero crossing (0.06 px).
     assert np.abs(error).max() < 0.03
     assert abs(error.mean()) < 0.001
-
-
-def position_bound(*, sigma, amplitude, read, gain):
-    """Return the Cramer-Rao bound of the centre, px, in variance read^2 + gain f: place, height and width unknown."""
-    step, variances = 1e-4, []
-    for centre in phases(16):
-
-        def at(dc=0.0, ds=0.0, c=centre):
-            return gaussian([c + dc], sigma=sigma + ds, amplitude=amplitude)[0]
-
-        jacobian = np.stack(
-            [(at(dc=step) - at(dc=-step)) / (2 * step), at() / amplitude, (at(ds=step) - at(ds=-step)) / (2 * step)],
-            axis=1,
-        )
-        weights = 1 / (read**2 + gain * at())
-        variances.append(np.linalg.inv((jacobian.T * weights) @ jacobian)[0, 0])
-    return math.sqrt(np.mean(variances))
 
 
 # Efficiency: the bound's variance over the centre's, measured 0.75 to 0.95 in shot and read noise and 0.66 to 0.79 in
@@ -98,7 +65,7 @@ def test_near_the_cramer_rao_bound(sigma, shot, white, amplitude, read, gain):
     profile = gaussian(centre, sigma=sigma, amplitude=amplitude)
     noise = np.sqrt(read**2 + gain * profile) * rng.standard_normal(profile.shape)
     error = centres((profile + 20 + noise).astype(np.float32)) - centre
-    efficiency = position_bound(sigma=sigma, amplitude=amplitude, read=read, gain=gain) ** 2 / error.var()
+    efficiency = position_bound(sigma=sigma, amplitude=amplitude, noise=read, gain=gain) ** 2 / error.var()
     assert (shot if gain else white) < efficiency < 1.15
     assert abs(error.mean()) < 5 * error.std() / math.sqrt(3000)
 
@@ -145,7 +112,7 @@ def test_one_line_alone(method):
 
 
 def test_a_symmetric_halo_moves_nothing_and_a_one_sided_one_no_more_than_other_methods():
-    centre = phases()
+    centre = phases(128)
     u = np.arange(LENGTH) - centre[:, None]
     stripe = gaussian(centre, sigma=1.5, amplitude=150) + 20
     both = (stripe + 15 * np.exp(-0.5 * (u / 10) ** 2)).astype(np.float32)

@@ -48,11 +48,11 @@ def rows(image, **settings):
     return extract_stripe(image, stripe_along="height", **settings)
 
 
-def position_bound(*, sigma, amplitude, noise):
-    """Return the Cramer-Rao bound of the centre, px, in white noise: position, amplitude and width unknown.
+def position_bound(*, sigma, amplitude, noise, gain=0.0):
+    """Return the Cramer-Rao bound of the centre, px: position, amplitude and width unknown.
 
-    Numerical derivatives of the pixel-integrated profile; the mean over phases of the inverse Fisher matrix's first
-    element.
+    The variance is noise^2 + gain f. Numerical derivatives of the pixel-integrated profile; the mean over phases of the
+    inverse Fisher matrix's first element.
     """
     step, variances = 1e-4, []
     for centre in phases(16):
@@ -64,18 +64,15 @@ def position_bound(*, sigma, amplitude, noise):
             [(at(dc=step) - at(dc=-step)) / (2 * step), at() / amplitude, (at(ds=step) - at(ds=-step)) / (2 * step)],
             axis=1,
         )
-        variances.append(np.linalg.inv(jacobian.T @ jacobian / noise**2)[0, 0])
+        variances.append(np.linalg.inv(jacobian.T / (noise**2 + gain * at()) @ jacobian)[0, 0])
     return math.sqrt(np.mean(variances))
 
 
 # Largest error over the pixel phase without noise. Zero crossing: aliasing of the Gaussian weight, which falls as
 # exp(-2 pi^2 s^2), and at sigma 4 the flanks that still hold a few thousandths of the stripe; measured 0.005 at both
-# ends. The profile fit has the same flanks, and at sigma 0.7 the pixel's width makes the profile no Gaussian. The other
-# two weigh pixels in part at the ends of a window where the profile is not zero.
-@pytest.mark.parametrize(
-    ("method", "limit"),
-    [("profile-fit", 0.008), ("zero-crossing", 0.008), ("centre-of-mass", 0.02), ("quadratic", 0.04)],
-)
+# ends. The other two weigh pixels in part at the ends of a window where the profile is not zero. The profile fit has
+# tests of its own.
+@pytest.mark.parametrize(("method", "limit"), [("zero-crossing", 0.008), ("centre-of-mass", 0.02), ("quadratic", 0.04)])
 @pytest.mark.parametrize("sigma", [0.7, 1.0, 1.5, 2.0, 3.0, 4.0])
 def test_bias_over_the_pixel_phase(method, limit, sigma):
     centre = phases()
@@ -156,8 +153,7 @@ def test_zero_crossing_is_the_least_noisy_in_white_noise():
 # b 2 R^3 / 3 / (sqrt(2 pi) sigma A), R = 2.25 sigma, 0.03 px. The tilt still acts on the width found and thus on where
 # the windows of the other two end, within the error with the phase that they have anyway.
 @pytest.mark.parametrize(
-    ("method", "limit"),
-    [("profile-fit", 0.005), ("zero-crossing", 0.003), ("centre-of-mass", 0.012), ("quadratic", 0.02)],
+    ("method", "limit"), [("zero-crossing", 0.003), ("centre-of-mass", 0.012), ("quadratic", 0.02)]
 )
 def test_linear_background_does_not_shift(method, limit):
     centre = phases()

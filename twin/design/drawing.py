@@ -14,8 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from twin.design.figures_of_merit import evaluate_field
-from twin.design.report.study_tables import number_text
-from twin.design.sensor_arrays import SensorArrays, extract_parameters
+from twin.design.sensor_arrays import extract_parameters
+from twin.design.study_tables import number_text
 from uwlts.model.placement import laser_pose
 from uwlts.model.sensor import Camera, Medium, Sensor, Window
 from uwlts.optics.design import WindowGeometry, standoff_mm, trace_pixels, trace_rays
@@ -84,7 +84,12 @@ def make_view(sensor: Sensor, medium: Medium) -> SideView:
         WindowGeometry.from_description(one, medium, sensor.laser.wavelength_nm, turned) if one.mounted else None
         for one, turned in ((camera.window, np.eye(3)), (sensor.laser.window, frame))
     ]
-    depths, reached = _reach(sensor, p)
+    depths = np.linspace(sensor.volume.near_mm, sensor.volume.far_mm, _DEPTHS)
+    places = np.linspace(-1, 1, _PLACES) * (1 - 1e-9)
+    with np.errstate(all="ignore"):
+        field = evaluate_field(np, p, depths.reshape(1, -1, 1), places.reshape(1, 1, -1), reflectance=0.5)
+    # Depths at which both camera and laser reach a part of the line.
+    reached = np.broadcast_to(field.in_view, (1, _DEPTHS, _PLACES))[0].any(axis=1)
     near, far = outer + depths[[0, -1]]
 
     end = pose.origin_mm + _BEYOND * ((on_sheet(np.array([far]))[0] - pose.origin_mm) @ pose.axis) * pose.axis
@@ -108,15 +113,6 @@ def make_view(sensor: Sensor, medium: Medium) -> SideView:
         outer_mm=outer,
         angle_rad=math.atan2(abs(pose.normal[2]), sideways),
     )
-
-
-def _reach(sensor: Sensor, p: SensorArrays) -> tuple[np.ndarray, np.ndarray]:
-    """Return depths (N,) of the volume from the window, and where both camera and laser reach a part of the line."""
-    places = np.linspace(-1, 1, _PLACES) * (1 - 1e-9)
-    depths = np.linspace(sensor.volume.near_mm, sensor.volume.far_mm, _DEPTHS)
-    with np.errstate(all="ignore"):
-        f = evaluate_field(np, p, depths.reshape(1, -1, 1), places.reshape(1, 1, -1), reflectance=0.5)
-    return depths, np.broadcast_to(f.in_view, (1, _DEPTHS, _PLACES))[0].any(axis=1)
 
 
 # --- camera and laser -------------------------------------------------------------------------------------------------

@@ -14,10 +14,10 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from plotly.subplots import make_subplots
 
+from twin.design import drawing, study_tables as tables
 from twin.design.choice import StudyResults, find_pareto_front
 from twin.design.designs import Columns, HighlightedDesign
 from twin.design.figures_of_merit import RENDERED_SCATTERING_DEPTH
-from twin.design.report import drawing, study_tables as tables
 from twin.design.study import Study
 from twin.design.verification import Agreement
 from uwlts.pages.toolkit import (
@@ -280,8 +280,8 @@ def page_text(
     """
     judged, collected = StudyResults(study, columns), FigureCollector()
     return render_page(
-        "twin.design.report",
-        "template.html.j2",
+        "twin.design",
+        "study_page.html.j2",
         interactive=collected,
         title=study.title,
         introduction=tables.introduction(judged),

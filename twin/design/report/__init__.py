@@ -1,1 +1,0 @@
-"""Page of a design study: charts, tables, and a drawing of the chosen design to scale."""
