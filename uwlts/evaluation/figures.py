@@ -10,11 +10,13 @@ from typing import Annotated, Any, ClassVar, Literal, assert_never, get_args
 import numpy as np
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic_core import to_jsonable_python
 
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import VDI_OUTLIER_SHARE
 from uwlts.model.artefacts import Artefact, PipeStandard, PlaneStandard, SphereStandard, StepStandard
-from uwlts.storage.truth import TruthStatus
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.truth import Truth, TruthStatus
 
 TOWARDS_SENSOR = np.array([0.0, 0.0, -1.0])
 """Direction from a surface to the sensor in the object coordinate system."""
@@ -216,7 +218,7 @@ class ArtefactEvaluation(ABC):
             "kind": self.kind,
             "figures_mm": self.figures_mm,
             "points_total": self.points_total,
-            **{name: _plain(getattr(self, name)) for name in own},
+            **{name: to_jsonable_python(getattr(self, name)) for name in own},
             "rejected_share": self.rejected_share,
             "vdi_range_mm": self.vdi_range_mm,
             "within_vdi_outliers": self.within_vdi_outliers,
@@ -226,14 +228,6 @@ class ArtefactEvaluation(ABC):
 def spread_mm(residuals_mm: np.ndarray) -> float:
     """Return the range of residuals, largest minus smallest (PE and RE of VDI/VDE 2634)."""
     return float(np.ptp(residuals_mm))
-
-
-def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    if isinstance(value, tuple):
-        return [_plain(item) for item in value]
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
 Verdict = Literal["exceeds the limit", "undecided", "within the limit", "no limit"]
@@ -303,36 +297,24 @@ class TruthComparison(StoredResult):
         return {key: value for key, value in plain(self).items() if value is not None}
 
 
-def compare_with_truth(
-    points: np.ndarray,
-    frame: np.ndarray,
-    line: np.ndarray,
-    *,
-    point_mm: np.ndarray,
-    normal: np.ndarray,
-    status: np.ndarray,
-    tolerance_mm: float = 0.01,
-) -> TruthComparison:
+def compare_with_truth(cloud: PointCloud, truth: Truth, *, tolerance_mm: float) -> TruthComparison:
     """Compare points with the true surface by their signed distances (p - p_true) . n.
 
-    ``points`` (N, 3) in mm come with their image and row or column (N,). ``point_mm`` and ``normal`` (F, L, 3) are the
-    true point and unit normal of each line of each frame, in the frame of the points. They count where ``status`` (F,
-    L) is 0, a visible stripe.
+    The true point and unit normal of a point's frame and line count where the true stripe is visible.
 
-    Raises EvaluationError if points have no frame and line or ones outside the truth, visible truth is not finite or
-    has no unit normals, or no point matches.
+    Raises EvaluationError if the cloud is of another capture, or points have no frame and line within the truth. The
+    same if visible truth is not finite or has no unit normals, or if no point matches.
     """
-    points, point_mm, normal = (np.asarray(values, dtype=np.float64) for values in (points, point_mm, normal))
-    frame, line = np.asarray(frame), np.asarray(line)
-    visible = np.asarray(status) == TruthStatus.VISIBLE
-    if points.shape != (len(points), 3) or frame.shape != (len(points),) or line.shape != frame.shape:
-        raise ValueError(f"expected (N, 3) points and (N,) indices; found {points.shape}, {frame.shape}, {line.shape}")
-    shapes = point_mm.shape, normal.shape, visible.shape
-    if visible.ndim != 2 or shapes[:2] != ((*visible.shape, 3),) * 2:
-        raise ValueError(f"expected truth of the shapes (F, L, 3), (F, L, 3), (F, L); found {shapes}")
+    images = cloud.metadata.get("images")
+    if images is not None and images != len(truth.status):
+        raise EvaluationError(
+            f"the cloud is of a capture of {images} images, the truth of one of {len(truth.status)}: give the truth "
+            "of the cloud's capture"
+        )
+    points, frame, line = cloud.points_mm, cloud.frame, cloud.line
+    point_mm, normal = (np.asarray(values, dtype=np.float64) for values in (truth.point_mm, truth.normal))
+    visible = truth.status == TruthStatus.VISIBLE
     outside = (frame < 0) | (frame >= visible.shape[0]) | (line < 0) | (line >= visible.shape[1])
-    if not np.isfinite(points).all():
-        raise EvaluationError("some points are not finite; remove them")
     if outside.any():
         first = int(np.argmax(outside))
         raise EvaluationError(
@@ -361,7 +343,7 @@ def compare_with_truth(
         is_matched=matched,
         error_mm=error,
         distance_mm=distance,
-        tolerance_mm=float(tolerance_mm),
+        tolerance_mm=tolerance_mm,
         mean_mm=float(signed.mean()),
         std_mm=float(signed.std()),
         rms_mm=float(np.sqrt(np.mean(signed**2))),

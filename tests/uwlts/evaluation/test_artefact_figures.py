@@ -18,6 +18,7 @@ from uwlts.model.artefacts import Artefact, PipeStandard, PlaneStandard, SphereS
 from uwlts.shapes.sphere import _propose_centres
 from uwlts.shapes.step import StepFace, label_step_faces, step_height
 from uwlts.storage.cloud import PointCloud
+from uwlts.storage.truth import Truth
 
 SIGMA = 0.1
 DUMBBELL = SphereStandard(diameters_mm=(50.12, 50.14), spacings_mm=(99.18,))
@@ -476,22 +477,23 @@ def test_unknown_artefacts_are_a_bug():
 # --- ground truth
 
 
-def truth_of_two_frames():
+def truth_of_two_frames(**change: np.ndarray) -> Truth:
     """Two frames of four lines on planes inclined by 3-4-5; line 3 is hidden in frame 1."""
     point = np.arange(24, dtype=float).reshape(2, 4, 3)
     normal = np.broadcast_to([0.0, 0.6, -0.8], (2, 4, 3)).copy()
     status = np.zeros((2, 4), dtype=np.uint8)
     status[1, 3] = 2
     point[1, 3] = normal[1, 3] = np.nan
-    return {"point_mm": point, "normal": normal, "status": status}
+    known = {"point_mm": point, "normal": normal, "status": status} | change
+    return Truth(centre_px=status, crossings=status, depth_mm=status, **known)
 
 
 def test_points_are_compared_with_their_own_truth():
     truth = truth_of_two_frames()
     frame, line = np.array([0, 0, 1, 1, 1]), np.array([0, 2, 1, 1, 3])
     offsets = np.array([[0, 0, 0], [5, 1, 0], [0, 0, -0.1], [0, 0.4, 0.3], [9, 9, 9]])
-    points = np.nan_to_num(truth["point_mm"][frame, line]) + offsets
-    result = compare_with_truth(points, frame, line, **truth, tolerance_mm=0.1)
+    points = np.nan_to_num(truth.point_mm[frame, line]) + offsets
+    result = compare_with_truth(PointCloud(points, np.ones(5), frame, line), truth, tolerance_mm=0.1)
     np.testing.assert_allclose(result.distance_mm, [0, 0.6, 0.08, 0, np.nan], atol=1e-12)
     np.testing.assert_allclose(result.error_mm[:4], offsets[:4], atol=1e-12)
     assert np.isnan(result.error_mm[4]).all()
@@ -513,29 +515,14 @@ def test_points_are_compared_with_their_own_truth():
     [
         ({"frame": np.array([-1])}, "outside the truth"),
         ({"line": np.array([4])}, "frame 0, line 4"),
-        ({"points": np.full((1, 3), np.nan)}, "finite"),
         ({"frame": np.array([1]), "line": np.array([3])}, "none of the 1"),
         ({"normal": np.full((2, 4, 3), 0.5)}, "unit length"),
         ({"point_mm": np.full((2, 4, 3), np.inf)}, "not finite"),
     ],
 )
 def test_truth_that_does_not_fit_is_refused(change, message):
-    call = {
-        "points": np.zeros((1, 3)),
-        "frame": np.array([0]),
-        "line": np.array([0]),
-        **truth_of_two_frames(),
-        **change,
-    }
+    change = dict(change)
+    frame, line = (change.pop(name, np.array([0])) for name in ("frame", "line"))
+    cloud = PointCloud(np.zeros((1, 3)), np.ones(1), frame, line)
     with pytest.raises(EvaluationError, match=message):
-        compare_with_truth(call.pop("points"), call.pop("frame"), call.pop("line"), **call)
-
-
-def test_truth_of_other_shapes_is_a_bug():
-    truth = truth_of_two_frames()
-    with pytest.raises(ValueError, match="expected truth of the shapes"):
-        compare_with_truth(
-            np.zeros((1, 3)), np.zeros(1, int), np.zeros(1, int), **{**truth, "normal": np.zeros((2, 4))}
-        )
-    with pytest.raises(ValueError, match=r"points and \(N,\) indices"):
-        compare_with_truth(np.zeros((1, 3)), np.zeros(2, int), np.zeros(1, int), **truth)
+        compare_with_truth(cloud, truth_of_two_frames(**change), tolerance_mm=0.1)
