@@ -12,9 +12,10 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from uwlts.comparison.change_reference import (
+    IdealShape,
     Reference,
-    ReferencePoints,
     fit_local_normals,
+    place_shape,
     read_datums,
     read_reference,
     require_enough,
@@ -22,13 +23,12 @@ from uwlts.comparison.change_reference import (
     select_seen_side,
     stated_variance,
 )
-from uwlts.comparison.ideal_shapes import IdealShape, place_shape
 from uwlts.comparison.local_means import OPTIONS, TWO_SIDED, LocalMeans, average_locally
 from uwlts.errors import EvaluationError
 from uwlts.fitting.local_surface import choose_disc_diameter, number_cubes
 from uwlts.model.sensor import Table
 from uwlts.model.short_text import Brief
-from uwlts.registration.surface_registration import Registration, SurfaceSample, register_to_surface
+from uwlts.registration.surface_registration import Registration, SurfaceSample, register_to_surface, select_within
 from uwlts.storage.cloud import WATER, PointCloud, PointUncertainty, rotate_covariances, rounding_std_mm
 from uwlts.storage.cloud_files import load_cloud
 from uwlts.storage.pose_files import Unit
@@ -49,10 +49,6 @@ class ChangedRegion:
     level_mm: float
     volume_mm3: float
     extent_mm: float
-
-    def record(self) -> Table:
-        """Return the region as JSON."""
-        return {**asdict(self), "centre_mm": list(self.centre_mm)}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -163,7 +159,7 @@ class SurfaceChange(Brief):
             "apart_mm": self.apart_mm,
             "disc_mm": self.disc_mm,
             "deep_mm": self.deep_mm,
-            "regions": [region.record() for region in self.regions()],
+            "regions": [asdict(region) for region in self.regions()],
             "registration": None
             if found is None
             else {
@@ -288,18 +284,18 @@ def compare_clouds(
             raise EvaluationError(f"{name} is {length:g}; expected a positive length in mm")
     disc = disc_mm or choose_disc_diameter(require_enough(new.points_mm, "cloud"), new.frame)
     surface = read_reference(reference, unit=reference_unit, disc_mm=disc)
-    exact = not isinstance(surface, ReferencePoints) or surface.meshed or surface.uncertainty is not None
+    exact = not isinstance(surface, SurfaceSample) or surface.meshed or surface.uncertainty is not None
     own, own_warnings = stated_variance(cloud_std_mm, known=new.uncertainty is not None, of="cloud")
     other, other_warnings = stated_variance(reference_std_mm, known=exact, of="reference")
     fixed = None if datums is None else read_datums(datums)
-    if isinstance(surface, ReferencePoints):
+    if isinstance(surface, SurfaceSample):
         require_same_unit(new.points_mm, require_enough(surface.points_mm, "reference"))
         if disc_mm is None and not surface.meshed:
             disc = max(disc, choose_disc_diameter(surface.points_mm, surface.frame))
         if fixed is not None and not register:
             raise EvaluationError("datums were given without a registration; set `register`")
     deep = deep_mm or OPTIONS.depth_per_disc * disc
-    if isinstance(surface, ReferencePoints):
+    if isinstance(surface, SurfaceSample):
         sides = _compare_with_points(
             new, surface, fixed, register=register, disc=disc, deep=deep, same_water=same_water
         )
@@ -310,7 +306,7 @@ def compare_clouds(
         variance = variance + found.std_along(sides.places, sides.normals) ** 2
     # Rounding errors of neighbouring points are equal where a surface is parallel to an axis, and do not average out.
     stored, read = 0.0, ()
-    if isinstance(surface, ReferencePoints):
+    if isinstance(surface, SurfaceSample):
         stored, read = surface.rounding_std_mm, surface.warnings
     variance = variance + rounding_std_mm(new) ** 2 + stored**2 + own + other
     if not np.isfinite(sides.distance_mm).any():
@@ -354,7 +350,7 @@ class _Distances:
 
 def _compare_with_points(
     new: PointCloud,
-    surface: ReferencePoints,
+    surface: SurfaceSample,
     datums: np.ndarray | None,
     *,
     register: bool,
@@ -366,19 +362,16 @@ def _compare_with_points(
     chosen, apart = _thin_points(points, disc / 2)
     depths: float | np.ndarray = deep
     if surface.normals is not None:
-        surface, depths = _restrict_to_seen(points[chosen], surface, deep_mm=deep, apart_mm=apart)
-    if register:
-        target = surface.points_mm
-        found = register_to_surface(
-            SurfaceSample(points, known, new.frame),
-            SurfaceSample(target, other, surface.frame),
-            reach_mm=deep,
-            datums=datums,
+        seen, depths = select_seen_side(
+            points[chosen], surface.points_mm, surface.normals, deep_mm=deep, apart_mm=apart
         )
+        surface = replace(surface, points_mm=surface.points_mm[seen], normals=surface.normals[seen])
+    if register:
+        found = register_to_surface(SurfaceSample(points, known, new.frame), surface, reach_mm=deep, datums=datums)
         points, known = _move_points(points, known, found)
         if other is not None:
             # The registration follows systematic errors of the reference.
-            followed = [found.moves_mm(step, target) for step in found.by_reference]
+            followed = [found.moves_mm(step, surface.points_mm) for step in found.by_reference]
             other = replace(other, patterns_mm=other.patterns_mm - np.array(followed, np.float32))
     places = points[chosen]
     normals = fit_local_normals(places, surface.points_mm, disc_mm=disc, given=surface.normals)
@@ -395,38 +388,26 @@ def _compare_with_points(
     return _Distances(places, apart, normals, here.mean_mm - there.mean_mm, variance, found, found, words)
 
 
-def _restrict_to_seen(
-    places: np.ndarray, surface: ReferencePoints, *, deep_mm: float, apart_mm: float
-) -> tuple[ReferencePoints, np.ndarray]:
-    assert surface.normals is not None
-    seen, deep = select_seen_side(places, surface.points_mm, surface.normals, deep_mm=deep_mm, apart_mm=apart_mm)
-    return replace(surface, points_mm=surface.points_mm[seen], normals=surface.normals[seen]), deep
-
-
 def _compare_with_shape(
     new: PointCloud, shape: IdealShape, datums: np.ndarray | None, *, register: bool, disc: float, deep: float
 ) -> _Distances:
-    points, known, chosen = new.points_mm, new.uncertainty, slice(None)
-    if datums is not None:
-        if not (register or shape.fitted):
-            raise EvaluationError(
-                "datums were given without a registration, and this shape has a given position; set `register`"
-            )
-        away = np.linalg.norm(points[:, None] - datums[:, :3], axis=2)
-        if shape.fitted:
-            chosen = np.flatnonzero(np.any(away <= datums[:, 3], axis=1))
+    points, known, fitted = new.points_mm, new.uncertainty, shape.point_mm is None
+    if datums is not None and not (register or fitted):
+        raise EvaluationError(
+            "datums were given without a registration, and this shape has a given position; set `register`"
+        )
+    chosen = slice(None) if datums is None or not fitted else select_within(points, datums)
     placed = place_shape(
         shape, points[chosen], uncertainty=None if known is None else known[chosen], frame=new.frame[chosen]
     )
     found, moved = placed.registration, None
     if found is not None and known is not None:
-        normals = placed.nearest(points).normals
-        followed = [found.moves_mm(step, points, normals) for step in found.by_cloud]
+        followed = [found.moves_mm(step, points, placed.nearest(points)[1]) for step in found.by_cloud]
         known = replace(known, patterns_mm=known.patterns_mm + np.array(followed, np.float32))
     elif found is None and register:
-        near = placed.nearest(points, reach_mm=deep)
-        below = points - near.distance_mm[:, None] * near.normals
-        target = SurfaceSample(below[np.isfinite(near.distance_mm)])
+        distance, normals = placed.nearest(points, reach_mm=deep)
+        below = points - distance[:, None] * normals
+        target = SurfaceSample(below[np.isfinite(distance)])
         found = moved = register_to_surface(
             SurfaceSample(points, known, new.frame), target, reach_mm=deep, datums=datums
         )
@@ -435,9 +416,9 @@ def _compare_with_shape(
     places = points[spread]
     here: LocalMeans = average_locally(
         places,
-        normals := placed.nearest(places).normals,
+        normals := placed.nearest(places)[1],
         points,
-        distance_mm=placed.nearest(points, reach_mm=deep).distance_mm,
+        distance_mm=placed.nearest(points, reach_mm=deep)[0],
         uncertainty=known,
         frame=new.frame,
         disc_mm=disc,

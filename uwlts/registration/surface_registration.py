@@ -25,20 +25,20 @@ _KNOWN = 1e12  # prior information on the amplitudes of systematic patterns: the
 
 
 @dataclass(frozen=True, eq=False)
-class Nearest:
-    """Signed distances (N,) of points from a shape along unit normals (N, 3); NaN beyond the search distance."""
-
-    distance_mm: np.ndarray
-    normals: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
 class SurfaceSample:
-    """Points (N, 3) of a surface, and for a cloud their uncertainty and images (N,)."""
+    """Points (N, 3) of a cloud with their uncertainty and images (N,), or samples of a mesh with normals (N, 3)."""
 
     points_mm: np.ndarray
     uncertainty: PointUncertainty | None = None
     frame: np.ndarray | None = None
+    normals: np.ndarray | None = None
+    rounding_std_mm: float = 0.0  # by the steps of a cloud's stored coordinates
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def meshed(self) -> bool:
+        """True for samples of a mesh, which are free of noise."""
+        return self.normals is not None
 
     def select(self, chosen: np.ndarray) -> SurfaceSample:
         """Return some of the points, by indices or a mask."""
@@ -119,26 +119,31 @@ def register_to_surface(
 
 
 def shape_registration(
-    points_mm: np.ndarray, near: Nearest, *, sized: bool, uncertainty: PointUncertainty | None, frame: np.ndarray | None
+    points_mm: np.ndarray,
+    distance_mm: np.ndarray,
+    normals: np.ndarray,
+    *,
+    sized: bool,
+    uncertainty: PointUncertainty | None,
+    frame: np.ndarray,
 ) -> Registration:
     """Return the uncertainty of a shape that was fitted to points by least squares, as a zero registration.
 
-    ``near`` are the distances of the points (N, 3) from the shape, and its normals; ``sized``: the radius was fitted,
-    too. The uncertainty of the points may be unknown (None).
+    Points (N, 3) of images ``frame`` (N,) have distances (N,) from the shape along its normals (N, 3). ``sized``: the
+    radius was fitted, too.
     """
     middle = points_mm.mean(axis=0)
-    by = _motion_derivatives(points_mm, near.normals, middle, sized=sized)
+    by = _motion_derivatives(points_mm, normals, middle, sized=sized)
     # Rotations are scaled by the rms radius, so that all unknowns are lengths.
     units = np.array([1.0] * 3 + [1 / max(rms_distance(points_mm, middle), 1e-9)] * 3 + [1.0] * sized)
     values, vectors = np.linalg.eigh((by * units).T @ (by * units))
     known = values > _LEAST * values[-1]
     answer = -units[:, None] * (vectors[:, known] / values[known]) @ vectors[:, known].T @ (by * units).T
-    covariance, patterns = np.mean(near.distance_mm**2) * answer @ answer.T, np.empty((0, len(answer)))
+    covariance, patterns = np.mean(distance_mm**2) * answer @ answer.T, np.empty((0, len(answer)))
     if uncertainty is not None:
-        images = np.arange(len(points_mm)) if frame is None else frame
-        covariance = covariance + grouped_covariance(answer, project_image_errors(uncertainty, near.normals), images)
-        patterns = np.einsum("mni,ni->mn", uncertainty.patterns_mm, near.normals) @ answer.T
-    rms = float(np.sqrt(np.mean(near.distance_mm**2)))
+        covariance = covariance + grouped_covariance(answer, project_image_errors(uncertainty, normals), frame)
+        patterns = np.einsum("mni,ni->mn", uncertainty.patterns_mm, normals) @ answer.T
+    rms = float(np.sqrt(np.mean(distance_mm**2)))
     none = np.empty((0, len(answer)))
     return Registration(np.eye(4), covariance, middle, (), rms, len(points_mm), patterns, none)
 
