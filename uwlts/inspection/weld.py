@@ -114,18 +114,21 @@ def inspect_weld(cloud: PointCloud | str | os.PathLike[str], *, section_mm: floa
         raise EvaluationError(
             f"the cloud has {len(cloud)} points; at least {_Rule.fewest_points} are needed for a weld"
         )
-    bead, notes = _prepare_bead(cloud, section_mm)
+    axes, middle, half, ends, others = _locate_bead(cloud.points_mm)
+    local = (cloud.points_mm - middle) @ axes.T
+    local[(local[:, 0] < ends[0]) | (local[:, 0] > ends[1])] = np.inf
+    tangents = np.broadcast_to(axes[:2], (len(cloud), 2, 3))
+    bead = build_bead(cloud, local, axes, middle, tangents, half_mm=half, section_mm=section_mm)
     errors = PointErrors.along_normals(cloud, bead.chosen, np.broadcast_to(bead.axes[2], (len(bead.chosen), 3)))
     values, extent, left_out = measure_bead(bead, errors)
     feature = Feature(FeatureKind.WELD, "weld", values, bead.middle_mm, bead.axes, extent, bead.chosen[bead.on_bead])
     deviation = np.full(len(cloud), np.nan)
     deviation[bead.chosen] = bead.heights_mm
     count = bead.profiles.sections
-    notes = [
-        f"{count} sections of {bead.length_mm / count:.2g} mm; the second axis points from left to right",
-        *notes,
-        *left_out,
-    ]
+    notes = [f"{count} sections of {bead.length_mm / count:.2g} mm; the second axis points from left to right"]
+    if others:
+        notes.append(f"{others} other beads beside the highest one are not measured: crop the cloud to measure them")
+    notes += left_out
     if cloud.uncertainty is None:
         notes.append(WITHOUT_UNCERTAINTY)
     return Inspection("weld", (feature,), deviation, np.full(len(cloud), np.nan), tuple(notes)).consider_cloud(cloud)
@@ -147,18 +150,6 @@ class Bead:
     noise_mm: np.ndarray  # (n,); standard deviation of independent point noise that explains the scatter of local means
     profiles: BeadProfiles
     footprint_std: float  # relative standard uncertainty of the squared footprints
-
-
-def _prepare_bead(cloud: PointCloud, section_mm: float | None) -> tuple[Bead, list[str]]:
-    """Return the highest bead with its plates and profiles, and notes on other beads."""
-    axes, middle, half, ends, others = _locate_bead(cloud.points_mm)
-    notes = [f"{others} other beads beside the highest one are not measured: crop the cloud to measure them"] * (
-        others > 0
-    )
-    local = (cloud.points_mm - middle) @ axes.T
-    local[(local[:, 0] < ends[0]) | (local[:, 0] > ends[1])] = np.inf
-    tangents = np.broadcast_to(axes[:2], (len(cloud), 2, 3))
-    return build_bead(cloud, local, axes, middle, tangents, half_mm=half, section_mm=section_mm), notes
 
 
 def build_bead(
