@@ -65,9 +65,12 @@ class PairEvidence:
     ways: tuple[tuple[int, int, PatchDistances], ...]
     """Source, target and distances in both directions, in the order of the rows."""
     places_mm: np.ndarray  # (patches, 3); positions of the surface distances
-    # Numbers of surface distances and of common spheres.
-    patches: int
-    spheres: int
+    patches: int  # number of surface distances
+
+    @property
+    def spheres(self) -> int:
+        """Number of common spheres."""
+        return (len(self.residuals) - self.patches) // 3
 
     def normal(self) -> np.ndarray:
         """Return the normal matrix (U, U)."""
@@ -367,7 +370,6 @@ class JointRegistration:
             tuple(ways),
             np.vstack([found.places_mm for *_, found in ways]) if ways else np.empty((0, 3)),
             len(relative),
-            len(spheres),
         )
 
     def _derivatives_by_poses(self, source: int, target: int, places: np.ndarray, directions: np.ndarray) -> np.ndarray:

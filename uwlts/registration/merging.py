@@ -24,9 +24,10 @@ def merge_clouds(
     points, random, position, frames, firsts = [], [], [], [], []
     first = 0
     for number, scan in enumerate(scans):
-        rotation = joint.poses[number, :3, :3]
-        points.append(_correct_points(scan, joint.patterns[number]) @ rotation.T + joint.poses[number, :3, 3])
-        known = scan.uncertainty
+        rotation, known, places = joint.poses[number, :3, :3], scan.uncertainty, scan.points_mm
+        if known is not None and len(amounts := joint.patterns[number]):
+            places = places + np.tensordot(amounts, known.patterns_mm, axes=1)
+        points.append(places @ rotation.T + joint.poses[number, :3, 3])
         random.append(np.zeros((len(scan), 6)) if known is None else rotate_covariances(known.random_mm2, rotation))
         position.append(np.zeros((len(scan), 3)) if known is None else known.position_mm @ rotation.T)
         frames.append(np.where(scan.frame == NO_INDEX, NO_INDEX, scan.frame + first))
@@ -60,12 +61,6 @@ def _rotate_image_poses(scans: Sequence[PointCloud], joint: JointRegistration) -
         if each is not None:
             parts[number][: len(each)] = each @ joint.poses[number, :3, :3].T
     return np.concatenate(parts, axis=1)
-
-
-def _correct_points(scan: PointCloud, amounts: np.ndarray) -> np.ndarray:
-    if scan.uncertainty is None or not len(amounts):
-        return scan.points_mm
-    return scan.points_mm + np.tensordot(amounts, scan.uncertainty.patterns_mm, axes=1)
 
 
 def _joint_patterns(

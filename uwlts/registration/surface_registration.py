@@ -157,9 +157,7 @@ def select_within(points: np.ndarray, datums: np.ndarray) -> np.ndarray:
     return np.any(np.linalg.norm(points[:, None] - datums[:, :3], axis=2) <= datums[:, 3], axis=1)
 
 
-def _motion_derivatives(
-    points: np.ndarray, normals: np.ndarray, middle: np.ndarray, *, sized: bool = False
-) -> np.ndarray:
+def _motion_derivatives(points: np.ndarray, normals: np.ndarray, middle: np.ndarray, *, sized: bool) -> np.ndarray:
     """Return the derivatives (N, 6) of distances by translation and rotation, or (N, 7) with the radius."""
     by = rigid_derivatives(points, normals, middle)
     return np.hstack([by, np.ones((len(by), 1))]) if sized else by
