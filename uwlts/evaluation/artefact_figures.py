@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise, permutations
-from typing import Any, ClassVar, assert_never
+from typing import Any, assert_never
 
 import numpy as np
 
@@ -55,8 +55,6 @@ class SpacingResult:
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SphereEvaluation(ArtefactEvaluation):
     """Evaluation of spheres in the order of the artefact's description, and of their consecutive spacings."""
-
-    kind: ClassVar[str] = "spheres"
 
     artefact: SphereStandard
     spheres: tuple[SphereResult, ...]
@@ -225,8 +223,6 @@ class PlaneEvaluation(ArtefactEvaluation):
     `normal` points to the sensor; deviations are positive on that side.
     """
 
-    kind: ClassVar[str] = "plane"
-
     re_mm: float
     std_mm: float
     point_mm: tuple[float, float, float]
@@ -243,8 +239,6 @@ class PipeEvaluation(ArtefactEvaluation):
     `ovality_mm` is the difference between the largest and smallest diameter of the elliptic component. It is None if
     less than half of the circumference is visible, since a shift of the axis then resembles ovality.
     """
-
-    kind: ClassVar[str] = "pipe"
 
     diameter_mm: float
     diameter_error_mm: float
@@ -338,8 +332,6 @@ def measure_ovality(points: np.ndarray, fit: Cylinder) -> float | None:
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StepEvaluation(ArtefactEvaluation):
     """Evaluation of a step, mm. Deviations refer to the reference face's plane, shifted by the calibrated height."""
-
-    kind: ClassVar[str] = "step"
 
     # Mean distance of the points of one face from the plane of the other; standard uncertainty by their scatter alone.
     height_mm: float

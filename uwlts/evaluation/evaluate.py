@@ -68,12 +68,6 @@ class ArtefactFigures(StoredResult):
             "surfaces, or check whether all images are of one scan"
         ]
 
-    @model_serializer(mode="wrap")
-    def _verdict_last(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        content = plain(self)
-        content["within_vdi_outliers"] = content.pop("within_vdi_outliers")
-        return content
-
 
 class Evaluation(Brief, StoredResult):
     """Result of `evaluate`, and content of its file.

@@ -72,7 +72,7 @@ def linearise_figures(cloud: PointCloud, evaluation: ArtefactEvaluation) -> Line
         case StepEvaluation():
             return _linearise_step(cloud, evaluation)
         case _:
-            raise TypeError(f"no figures of {evaluation.kind} are known")
+            raise TypeError(f"no figures of {evaluation.artefact.kind} are known")
 
 
 def shift_std_mm(cloud: PointCloud, used: np.ndarray) -> np.ndarray:

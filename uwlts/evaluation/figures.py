@@ -5,7 +5,7 @@ import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Annotated, Any, ClassVar, Literal, assert_never, get_args
+from typing import Annotated, Any, Literal, assert_never, get_args
 
 import numpy as np
 import pydantic
@@ -164,8 +164,6 @@ class ArtefactEvaluation(ABC):
     cloud, NaN for all others.
     """
 
-    kind: ClassVar[str]
-
     artefact: Artefact
     points_used: int
     points_rejected: int
@@ -215,7 +213,7 @@ class ArtefactEvaluation(ABC):
             field.name for field in dataclasses.fields(self) if field.name not in ("artefact", "deviation_mm", "labels")
         ]
         return {
-            "kind": self.kind,
+            "kind": self.artefact.kind,
             "figures_mm": self.figures_mm,
             "points_total": self.points_total,
             **{name: to_jsonable_python(getattr(self, name)) for name in own},

@@ -175,7 +175,12 @@ def point_uncertainty(
     middle = np.mean(capture.stage_mm[by_stage_alone]) if by_stage_alone.any() else 0.0
     stage = np.where(by_stage_alone, capture.stage_mm - middle, 0.0)
     root, by_stage = independent_components(known, calibration, header)
-    frame_by = -known.frame_by if mount_by is None else _rotate_to_sensor(mount_by, header)
+    frame_by = -known.frame_by
+    if mount_by is not None:
+        # Translation and rotation, from platform axes to sensor axes.
+        frame_by = np.vstack(
+            [np.array(header.T_platform_sensor)[:3, :3].T @ part for part in (mount_by[:3], mount_by[3:])]
+        )
     rigid = frame_by @ root[: frame_by.shape[1]]
     rigid[0, -1] = window_shift_std_mm(sensor) if mount_by is None else 0.0
     exact = partial(_derivatives, known, root, rigid)
@@ -292,12 +297,6 @@ def window_shift_std_mm(sensor: Sensor) -> float:
     """
     window, tilt = sensor.laser.window, np.radians(sensor.uncertainty.laser_window_tilt_deg)
     return window.thickness_mm * (1 - 1 / window.index(sensor.laser.wavelength_nm)) * tilt if window.mounted else 0.0
-
-
-def _rotate_to_sensor(mount_by: np.ndarray, header: CaptureHeader) -> np.ndarray:
-    """Rotate the derivatives (6, P) of a mount, translation and rotation, from platform axes to sensor axes."""
-    turn = np.array(header.T_platform_sensor)[:3, :3]
-    return np.vstack([turn.T @ mount_by[:3], turn.T @ mount_by[3:]])
 
 
 def _derivatives(

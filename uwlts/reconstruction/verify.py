@@ -19,14 +19,6 @@ from uwlts.storage.calibration_file import VerificationRecord, resolve_calibrati
 from uwlts.storage.capture import Capture, open_capture
 
 
-def normalise_error(error: float, measured: float | None, calibrated: float | None) -> float | None:
-    """Return E_n of ISO/IEC 17043 from the expanded uncertainties of both values; None if the measured one is unknown.
-
-    An unknown uncertainty of the calibrated value counts as zero.
-    """
-    return None if measured is None else abs(error) / float(np.hypot(measured, calibrated or 0.0))
-
-
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
     """Result for one calibrated quantity, mm.
@@ -55,7 +47,7 @@ class Verdict:
     @property
     def normalised_error(self) -> float | None:
         """E_n of ISO/IEC 17043, error divided by expanded uncertainty; None if that of the measurement is unknown."""
-        return normalise_error(self.error_mm, self.measured_expanded_mm, self.calibrated_expanded_mm)
+        return None if self.measured_expanded_mm is None else abs(self.error_mm) / self.expanded_mm
 
     @property
     def passed(self) -> bool:

@@ -463,7 +463,7 @@ def test_results_are_plain_json():
     ]
     for evaluation in evaluations:
         back = json.loads(json.dumps(evaluation.as_dict(), allow_nan=False))
-        assert back["kind"] == evaluation.kind
+        assert back["kind"] == evaluation.artefact.kind
         assert back["figures_mm"] == evaluation.figures_mm
         assert back["points_used"] == np.count_nonzero(np.isfinite(evaluation.deviation_mm))
         assert "deviation_mm" not in back
