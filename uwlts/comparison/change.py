@@ -383,7 +383,10 @@ def _compare_with_points(
     variance = here.variance_mm2 + (0.0 if surface.meshed else there.variance_mm2)
     variance += np.sum(here.patterns_mm**2, axis=1) + np.sum(there.patterns_mm**2, axis=1)
     if known is not None and other is not None:
-        variance -= 2 * _shared_covariance(here.patterns_mm, known, there.patterns_mm, other, same_water=same_water)
+        for name in known.shared.keys() & other.shared.keys():
+            if same_water or not name.startswith(WATER):
+                ours, theirs = here.patterns_mm @ known.shared[name], there.patterns_mm @ other.shared[name]
+                variance -= 2 * np.sum(ours * theirs, axis=1)
     words = "mesh" if surface.meshed else "cloud"
     return _Distances(places, apart, normals, here.mean_mm - there.mean_mm, variance, found, found, words)
 
@@ -427,17 +430,6 @@ def _compare_with_shape(
     variance = here.variance_mm2 + np.sum(here.patterns_mm**2, axis=1)
     reference = placed.describe() + placed.note_misfit(places, here.mean_mm, variance)
     return _Distances(places, apart, normals, here.mean_mm, variance, found, moved, reference)
-
-
-def _shared_covariance(
-    here: np.ndarray, known: PointUncertainty, there: np.ndarray, other: PointUncertainty, *, same_water: bool
-) -> np.ndarray:
-    """Return the covariance (P,) of the local means of two clouds by shared errors, from the shifts (P, M) of each."""
-    result = np.zeros(len(here))
-    for name in known.shared.keys() & other.shared.keys():
-        if same_water or not name.startswith(WATER):
-            result += np.sum((here @ known.shared[name]) * (there @ other.shared[name]), axis=1)
-    return result
 
 
 def _estimate_areas(places: np.ndarray) -> np.ndarray:

@@ -189,7 +189,10 @@ def build_bead(
     if section_mm is not None:
         count = max(1, int(length / section_mm))
     section = np.clip(((along - along.min()) / length * count).astype(int), 0, count - 1)
-    gap = _typical_gap(across, section)
+    # The gap between points of a section that contains the median place across.
+    order = np.lexsort((across, section))
+    gaps = np.sort(np.diff(across[order])[np.diff(section[order]) == 0])
+    gap = float(gaps[np.searchsorted(np.cumsum(gaps), 0.5 * gaps.sum())])
     spacing = max(2 * reach * count / len(along), _Rule.gap_spacings * gap)
     bandwidth = max(_Rule.bandwidth * 2 * half, _Rule.spacings_in_bandwidth * spacing)
     edge = half * (1 + 2 * _Rule.groove_outside) + bandwidth
@@ -212,14 +215,6 @@ def build_bead(
     seen = seen * np.maximum(scatter / float(np.median(scatter[np.abs(across) > half * (1 + _Rule.groove_outside)])), 1)
     on_bead = np.abs(across) < half
     return Bead(axes, middle, chosen, raw, heights, on_bead, half, length, gap, seen, profiles, footprint_std)
-
-
-def _typical_gap(across: np.ndarray, section: np.ndarray) -> float:
-    """Return the gap between points of a section that contains the median place across."""
-    order = np.lexsort((across, section))
-    gaps = np.diff(across[order])[np.diff(section[order]) == 0]
-    gaps = np.sort(gaps)
-    return float(gaps[np.searchsorted(np.cumsum(gaps), 0.5 * gaps.sum())])
 
 
 def _local_scatter(profiles: BeadProfiles, raw: np.ndarray, across: np.ndarray, bandwidth: float) -> np.ndarray:

@@ -105,12 +105,14 @@ def register_to_surface(
     _, pairs, solution, covariance = settle(joint, approach(joint, reach_mm, names), names)
     (pair,) = pairs.values()
     of_reference, of_cloud = (-solution.response[:6, :6] @ pair.normal()[:6, each] for each in joint.pattern_columns)
-    left = pair.residuals[pair.counted]
+    left, ways = pair.residuals[pair.counted], solution.open_directions / joint.units[:6]
+    # Open motions are named by their large components.
+    large = (np.flatnonzero(np.abs(way) > 0.3 * np.abs(way).max()) for way in ways)
     return Registration(
         joint.poses[1],
         covariance[:6, :6],
         joint.middles_mm[1],
-        tuple(map(_name_motion, solution.open_directions / joint.units[:6])),
+        tuple(" with ".join(_NAMES[k] for k in each) for each in large),
         float(np.sqrt(np.mean(left**2))),
         len(left),
         of_cloud.T,
@@ -161,9 +163,3 @@ def _motion_derivatives(points: np.ndarray, normals: np.ndarray, middle: np.ndar
     """Return the derivatives (N, 6) of distances by translation and rotation, or (N, 7) with the radius."""
     by = rigid_derivatives(points, normals, middle)
     return np.hstack([by, np.ones((len(by), 1))]) if sized else by
-
-
-def _name_motion(direction: np.ndarray) -> str:
-    """Name the large components of a motion."""
-    large = np.flatnonzero(np.abs(direction) > 0.3 * np.abs(direction).max())
-    return " with ".join(_NAMES[k] for k in large)
