@@ -37,19 +37,27 @@ def figure_uncertainties(cloud: PointCloud, evaluation: ArtefactEvaluation) -> d
     """
     if (uncertainty := cloud.uncertainty) is None:
         return {}
-    plain, figures = evaluation.figures_mm, linearise_figures(cloud, evaluation)
-
-    def changed(by: np.ndarray) -> np.ndarray:
-        moved = figures.figures_mm(by)
-        return np.array([moved[name] - value for name, value in plain.items()])
-
+    figures = linearise_figures(cloud, evaluation)
     errors = PointErrors.from_uncertainty(uncertainty, cloud.frame)
     draws = int(np.clip(_DRAWN_POINTS // len(cloud.points_mm), _FEWEST_DRAWS, _MOST_DRAWS))
-    by_noise, by_calibration = errors.propagate(changed, draws=draws)
-    assert by_calibration is not None
-    stated = {name: (float(r), float(s)) for name, r, s in zip(plain, by_noise, by_calibration, strict=True)}
+    stated = propagate_figures(errors, evaluation.figures_mm, figures.figures_mm, draws=draws)
     linear = {name: errors.linear_std(by_points) for name, by_points in figures.gradients.items()}
-    return {name: FigureUncertainty(linear.get(name, random), system) for name, (random, system) in stated.items()}
+    return stated | {name: replace(stated[name], random_mm=std) for name, std in linear.items()}
+
+
+def propagate_figures(
+    errors: PointErrors, figures_mm: dict[str, float], after: Callable[[np.ndarray], dict[str, float]], *, draws: int
+) -> dict[str, FigureUncertainty]:
+    """Return the uncertainties of figures; ``after`` returns the figures after shifts (N, 3) of the points."""
+
+    def changed(moves: np.ndarray) -> list[float]:
+        moved = after(moves)
+        return [moved[name] - value for name, value in figures_mm.items()]
+
+    random, systematic = errors.propagate(changed, draws=draws)
+    assert systematic is not None
+    found = zip(figures_mm, random, systematic, strict=True)
+    return {name: FigureUncertainty(float(by_noise), float(common)) for name, by_noise, common in found}
 
 
 @dataclass(frozen=True, eq=False)
