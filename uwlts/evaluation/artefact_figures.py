@@ -9,7 +9,7 @@ from typing import Any, assert_never
 import numpy as np
 
 from uwlts.errors import EvaluationError
-from uwlts.evaluation.figures import TOWARDS_SENSOR, ArtefactEvaluation, FigureId, Quantity, spread_mm
+from uwlts.evaluation.figures import TOWARDS_SENSOR, ArtefactEvaluation, FigureId, Quantity
 from uwlts.fitting.least_squares import RobustFit, fit_robustly
 from uwlts.model.artefacts import Artefact, PipeStandard, PlaneStandard, SphereStandard, StepStandard
 from uwlts.shapes.cylinder import Cylinder
@@ -70,11 +70,6 @@ class SphereEvaluation(ArtefactEvaluation):
         """Largest standard deviation of the radial residuals of a sphere."""
         return max(sphere.std_mm for sphere in self.spheres)
 
-    @property
-    def sse_mm(self) -> float | None:
-        """Signed sphere spacing error of the largest absolute value; None for a single sphere."""
-        return max((spacing.sse_mm for spacing in self.spacings), key=abs, default=None)
-
     def values_mm(self) -> dict[FigureId, float | None]:
         kind = Quantity
         values: dict[FigureId, float | None] = {(kind.PROBING_ERROR, ()): self.pe_mm, (kind.STD, ()): self.std_mm}
@@ -112,7 +107,7 @@ def evaluate_spheres(points: np.ndarray, artefact: SphereStandard) -> SphereEval
                 diameter_mm=2 * fit.radius_mm,
                 diameter_error_mm=2 * fit.radius_mm - diameter,
                 diameter_std_mm=2 * float(np.sqrt(fit.covariance[3, 3])),
-                pe_mm=spread_mm(fit.residuals_mm),
+                pe_mm=float(np.ptp(fit.residuals_mm)),
                 std_mm=fit.std_mm,
                 points_used=len(used),
                 points_rejected=robust.rejected,
@@ -267,7 +262,7 @@ def evaluate_plane(points: np.ndarray, artefact: PlaneStandard) -> PlaneEvaluati
     return PlaneEvaluation(
         artefact=artefact,
         **counts,
-        re_mm=spread_mm(robust.fit.residuals_mm),
+        re_mm=float(np.ptp(robust.fit.residuals_mm)),
         std_mm=robust.fit.std_mm,
         point_mm=tuple(robust.fit.point_mm.tolist()),
         normal=tuple(robust.fit.normal.tolist()),
@@ -294,7 +289,7 @@ def evaluate_pipe(points: np.ndarray, artefact: PipeStandard) -> PipeEvaluation:
         diameter_mm=2 * fit.radius_mm,
         diameter_error_mm=error,
         diameter_std_mm=2 * float(np.sqrt(fit.covariance[4, 4])),
-        range_mm=spread_mm(fit.residuals_mm),
+        range_mm=float(np.ptp(fit.residuals_mm)),
         std_mm=fit.std_mm,
         ovality_mm=measure_ovality(points[robust.inliers], fit),
         point_mm=tuple(fit.point_mm.tolist()),

@@ -13,7 +13,7 @@ from uwlts.evaluation.artefact_figures import (
     measure_ovality,
     measure_step,
 )
-from uwlts.evaluation.figures import ArtefactEvaluation, FigureUncertainty, Quantity, spread_mm
+from uwlts.evaluation.figures import ArtefactEvaluation, FigureUncertainty, Quantity
 from uwlts.fitting.propagation import LinearisedFit, PointErrors, noise_shifts
 from uwlts.model.artefacts import StepStandard
 from uwlts.shapes.cylinder import Cylinder
@@ -108,7 +108,7 @@ def _linearise_plane(points: np.ndarray, evaluation: PlaneEvaluation) -> Lineari
 
     def figures_mm(moves: np.ndarray) -> dict[str, float]:
         residuals = fit.shift(moves)[1]
-        return replace(evaluation, re_mm=spread_mm(residuals), std_mm=fit.std_mm(residuals)).figures_mm
+        return replace(evaluation, re_mm=float(np.ptp(residuals)), std_mm=fit.std_mm(residuals)).figures_mm
 
     return LinearisedFigures(figures_mm, {})
 
@@ -123,7 +123,7 @@ def _linearise_pipe(points: np.ndarray, evaluation: PipeEvaluation) -> Linearise
         return replace(
             evaluation,
             diameter_error_mm=evaluation.diameter_error_mm + 2 * float(step[4]),
-            range_mm=spread_mm(residuals),
+            range_mm=float(np.ptp(residuals)),
             std_mm=fit.std_mm(residuals),
             ovality_mm=measure_ovality(points[used], replace(pipe, residuals_mm=residuals)),
         ).figures_mm
@@ -175,7 +175,7 @@ def _linearise_spheres(points: np.ndarray, evaluation: SphereEvaluation) -> Line
             replace(
                 sphere,
                 diameter_error_mm=sphere.diameter_error_mm + 2 * step[3],
-                pe_mm=spread_mm(residuals),
+                pe_mm=float(np.ptp(residuals)),
                 std_mm=fit.std_mm(residuals),
             )
             for sphere, fit, (step, residuals) in zip(evaluation.spheres, free, spheres[0], strict=True)

@@ -189,7 +189,7 @@ class ArtefactEvaluation(ABC):
     def vdi_range_mm(self) -> float:
         """Range of the deviations without the 0.3 % of the points with the largest ones, as VDI/VDE 2634 allows."""
         used = self.deviation_mm[np.isfinite(self.deviation_mm)]
-        return spread_mm(used[np.argsort(np.abs(used))[: len(used) - int(VDI_OUTLIER_SHARE * len(used))]])
+        return float(np.ptp(used[np.argsort(np.abs(used))[: len(used) - int(VDI_OUTLIER_SHARE * len(used))]]))
 
     @abstractmethod
     def values_mm(self) -> dict[FigureId, float | None]:
@@ -221,11 +221,6 @@ class ArtefactEvaluation(ABC):
             "vdi_range_mm": self.vdi_range_mm,
             "within_vdi_outliers": self.within_vdi_outliers,
         }
-
-
-def spread_mm(residuals_mm: np.ndarray) -> float:
-    """Return the range of residuals, largest minus smallest (PE and RE of VDI/VDE 2634)."""
-    return float(np.ptp(residuals_mm))
 
 
 Verdict = Literal["exceeds the limit", "undecided", "within the limit", "no limit"]
