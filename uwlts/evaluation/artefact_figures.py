@@ -9,7 +9,7 @@ from typing import Any, assert_never
 import numpy as np
 
 from uwlts.errors import EvaluationError
-from uwlts.evaluation.figures import TOWARDS_SENSOR, ArtefactEvaluation, FigureId, Quantity
+from uwlts.evaluation.figures import TOWARDS_SENSOR, ArtefactEvaluation
 from uwlts.fitting.least_squares import RobustFit, fit_robustly
 from uwlts.model.artefacts import Artefact, PipeStandard, PlaneStandard, SphereStandard, StepStandard
 from uwlts.shapes.cylinder import Cylinder
@@ -70,17 +70,10 @@ class SphereEvaluation(ArtefactEvaluation):
         """Largest standard deviation of the radial residuals of a sphere."""
         return max(sphere.std_mm for sphere in self.spheres)
 
-    def values_mm(self) -> dict[FigureId, float | None]:
-        kind = Quantity
-        values: dict[FigureId, float | None] = {(kind.PROBING_ERROR, ()): self.pe_mm, (kind.STD, ()): self.std_mm}
-        for number, sphere in enumerate(self.spheres, start=1):
-            values[kind.PROBING_ERROR, (number,)] = sphere.pe_mm
-            values[kind.STD, (number,)] = sphere.std_mm
-            values[kind.DIAMETER_ERROR, (number,)] = sphere.diameter_error_mm
-        for number, spacing in enumerate(self.spacings, start=1):
-            values[kind.SPACING_ERROR, (number, number + 1)] = spacing.sse_mm
-            values[kind.SPACING_ERROR_KNOWN_RADIUS, (number, number + 1)] = spacing.sse_known_radius_mm
-        return values
+    def part_of(self, spheres: tuple[int, ...]) -> object:
+        if not spheres:
+            return self
+        return (self.spheres if len(spheres) == 1 else self.spacings)[spheres[0] - 1]
 
 
 def evaluate_spheres(points: np.ndarray, artefact: SphereStandard) -> SphereEvaluation:
@@ -223,9 +216,6 @@ class PlaneEvaluation(ArtefactEvaluation):
     point_mm: tuple[float, float, float]
     normal: tuple[float, float, float]
 
-    def values_mm(self) -> dict[FigureId, float | None]:
-        return {(Quantity.RANGE_ERROR, ()): self.re_mm, (Quantity.STD, ()): self.std_mm}
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PipeEvaluation(ArtefactEvaluation):
@@ -243,14 +233,6 @@ class PipeEvaluation(ArtefactEvaluation):
     ovality_mm: float | None
     point_mm: tuple[float, float, float]
     axis: tuple[float, float, float]
-
-    def values_mm(self) -> dict[FigureId, float | None]:
-        return {
-            (Quantity.DIAMETER_ERROR, ()): self.diameter_error_mm,
-            (Quantity.RANGE, ()): self.range_mm,
-            (Quantity.STD, ()): self.std_mm,
-            (Quantity.OVALITY, ()): self.ovality_mm,
-        }
 
 
 def evaluate_plane(points: np.ndarray, artefact: PlaneStandard) -> PlaneEvaluation:
@@ -347,12 +329,10 @@ class StepEvaluation(ArtefactEvaluation):
     point_mm: tuple[float, float, float]
     labels: np.ndarray  # (N,) int8; face of each point (`StepFace`)
 
-    def values_mm(self) -> dict[FigureId, float | None]:
-        return {
-            (Quantity.HEIGHT_ERROR, ()): self.height_error_mm,
-            (Quantity.STD, ()): max(self.lower_std_mm, self.upper_std_mm),
-            (Quantity.PROFILE_HEIGHT_ERROR, ()): self.profile_height_error_mm,
-        }
+    @property
+    def std_mm(self) -> float:
+        """Larger one of both standard deviations."""
+        return max(self.lower_std_mm, self.upper_std_mm)
 
 
 def evaluate_step(points: np.ndarray, frame: np.ndarray, artefact: StepStandard) -> StepEvaluation:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Any, Literal, assert_never, get_args
@@ -37,8 +36,19 @@ class Quantity(StrEnum):
     PROFILE_HEIGHT_ERROR = "profile height error"
 
 
-FigureId = tuple[Quantity, tuple[int, ...]]
-"""Quantity and the numbers (from 1) of its spheres; no numbers for a figure of the whole artefact."""
+_FIELDS = {
+    Quantity.PROBING_ERROR: "pe_mm",
+    Quantity.RANGE_ERROR: "re_mm",
+    Quantity.RANGE: "range_mm",
+    Quantity.STD: "std_mm",
+    Quantity.OVALITY: "ovality_mm",
+    Quantity.DIAMETER_ERROR: "diameter_error_mm",
+    Quantity.SPACING_ERROR: "sse_mm",
+    Quantity.SPACING_ERROR_KNOWN_RADIUS: "sse_known_radius_mm",
+    Quantity.HEIGHT_ERROR: "height_error_mm",
+    Quantity.PROFILE_HEIGHT_ERROR: "profile_height_error_mm",
+}
+"""Fields of an evaluation, a sphere or a spacing."""
 
 
 @dataclass(frozen=True)
@@ -156,7 +166,7 @@ def _sphere_keys(artefact: SphereStandard) -> tuple[FigureKey, ...]:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ArtefactEvaluation(ABC):
+class ArtefactEvaluation:
     """Figures of an artefact and the numbers of its points.
 
     ``points_rejected`` counts the outliers on the artefact (`fit_robustly`). Points that do not belong to the artefact
@@ -191,15 +201,15 @@ class ArtefactEvaluation(ABC):
         used = self.deviation_mm[np.isfinite(self.deviation_mm)]
         return float(np.ptp(used[np.argsort(np.abs(used))[: len(used) - int(VDI_OUTLIER_SHARE * len(used))]]))
 
-    @abstractmethod
-    def values_mm(self) -> dict[FigureId, float | None]:
-        """Return the values of the figures, mm; None or no entry for a figure that could not be measured."""
+    def part_of(self, spheres: tuple[int, ...]) -> object:
+        """Return the result that has the figures of one sphere or of two; the evaluation itself without any."""
+        return self
 
     @property
     def figures(self) -> tuple[Figure, ...]:
-        """Measured figures of the artefact."""
-        values = self.values_mm()
-        found = ((key, values.get((key.quantity, key.spheres))) for key in figure_keys(self.artefact))
+        """Figures of the artefact that could be measured."""
+        keys = figure_keys(self.artefact)
+        found = ((key, getattr(self.part_of(key.spheres), _FIELDS[key.quantity])) for key in keys)
         return tuple(Figure(key, value) for key, value in found if value is not None)
 
     @property
