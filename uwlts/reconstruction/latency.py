@@ -34,19 +34,11 @@ _OUTLIER = 4.0
 """Outlier limit in standard deviations; one in 16,000 Gaussian distances exceeds it."""
 
 
-@dataclass(frozen=True)
-class Latency:
-    """Delay ``latency_s`` of the stage positions relative to the camera, with its standard uncertainty ``std_s``.
+def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s: np.ndarray) -> tuple[float, float]:
+    """Measure the latency of the stage positions relative to the camera, s, and its standard uncertainty.
 
-    The true position of a frame is the reported one plus its speed times the latency.
-    """
-
-    latency_s: float
-    std_s: float
-
-
-def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s: np.ndarray) -> Latency:
-    """Measure the latency from passes in both directions over a static surface.
+    The true position of a frame is the reported one plus its speed times the latency. It follows from passes in both
+    directions over a static surface.
 
     Parameters
     ----------
@@ -105,7 +97,7 @@ def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s:
         if abs(further) < 1e-6:
             break
     std = _GRAIN * float(np.std(away)) * float(np.sqrt((weight**2).sum()) / (weight * slope).sum())
-    return Latency(shift / (2 * speed), std / (2 * speed))
+    return shift / (2 * speed), std / (2 * speed)
 
 
 def _cost(surface: "_Surface", backward: "_Surface", shift: float) -> tuple[float, float]:
