@@ -135,14 +135,9 @@ def limit_deviations(
     Outliers of one direction within ``together_mm`` of each other, more than chance explains with the given probability
     of a false alarm, show a small blemish: they are no outliers, and keep their heights.
 
-    Returns
-    -------
-    surface : UnrolledSurface
-        Surface with limited deviations.
-    outliers : (N,) bool
-        Points far from their neighbours, relative to the neighbours' scatter.
-    ratio : float
-        Standard deviation of the other points from the medians, divided by that of the limited deviations.
+    Returns the surface with limited deviations; a mask (N,) of outliers, far from their neighbours relative to these
+    neighbours' scatter; and the standard deviation of the other points from the medians, divided by that of the limited
+    deviations.
     """
     nearest = np.empty((len(surface.places), SEARCH_RULE.neighbours), np.int32)
     middle, spread = np.empty(len(nearest)), np.empty(len(nearest))

@@ -37,20 +37,11 @@ _OUTLIER = 4.0
 def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s: np.ndarray) -> tuple[float, float]:
     """Measure the latency of the stage positions relative to the camera, s, and its standard uncertainty.
 
-    The true position of a frame is the reported one plus its speed times the latency. It follows from passes in both
-    directions over a static surface.
+    The true position of a frame is the reported one plus its speed times the latency. Passes in both directions over a
+    static surface show it: stripe centres (N, L) of the frames on all profile lines, NaN without a stripe, and
+    positions and signed speeds (N,) of the stage.
 
-    Parameters
-    ----------
-    centre_px : (N, L)
-        Stripe centres of each frame on all profile lines; NaN without a stripe.
-    stage_mm, speed_mm_per_s : (N,)
-        Position and signed speed of the stage at each frame.
-
-    Raises
-    ------
-    EvaluationError
-        A pass is missing, or the surface has too little relief along the motion.
+    EvaluationError if a pass is missing, or the surface has too little relief along the motion.
     """
     there, back = (np.flatnonzero(sign * speed_mm_per_s > 0) for sign in (1, -1))
     if min(len(there), len(back)) < 4:

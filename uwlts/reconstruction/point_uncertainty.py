@@ -136,29 +136,16 @@ def point_uncertainty(
     the stage's position, scale and direction about its central position, and drift of the water since the calibration,
     unless the calibration uses this capture. It excludes errors of poses (`uwlts.reconstruction.moving`).
 
-    Parameters
-    ----------
-    capture, calibration
-        Capture and joint calibration of the points.
-    frame, line, centre_px : (N,)
-        Image, profile line and position of each stripe centre.
-    blur_px : (N,), optional
-        Possible shift of the centres by blur; its relative error is common to all points.
-    beside_mm : (N, 3), optional
-        Applied shift of the points to the origin of their light (`uwlts.optics.brightness`); its relative error is
-        common to all points.
-    mount_by : (6, P), optional
-        Derivatives of a calibrated mount by the parameters of the joint estimate (`uwlts.model.mount.SensorShare`), for
-        frames with poses of a platform. They correlate the errors of points and mount. By default poses and described
-        mount, or the stage, place the true OCS, from which the calibrated one differs by the errors of camera axis and
-        sheet.
-    digest
-        Digest of the calibration, if known.
+    ``frame``, ``line`` and ``centre_px`` (N,) are image, profile line and position of each stripe centre. ``blur_px``
+    (N,) is the possible shift of the centres by blur, ``beside_mm`` (N, 3) the applied shift of the points to the
+    origin of their light (`uwlts.optics.brightness`); their relative errors are common to all points.
 
-    Raises
-    ------
-    CalibrationError
-        The calibration has no joint estimate, or it cannot reconstruct the points.
+    ``mount_by`` (6, P) are the derivatives of a calibrated mount by the parameters of the joint estimate
+    (`uwlts.model.mount.SensorShare`), for frames with poses of a platform. They correlate the errors of points and
+    mount. By default poses and described mount, or the stage, place the true OCS, from which the calibrated one differs
+    by the errors of camera axis and sheet. ``digest`` is that of the calibration, if known.
+
+    CalibrationError if the calibration has no joint estimate, or cannot reconstruct the points.
     """
     header = capture.header
     sensor = header.sensor
