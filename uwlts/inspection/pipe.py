@@ -101,18 +101,17 @@ def inspect_pipe(
         )
     if len(cloud) < _FEWEST_POINTS:
         raise EvaluationError(f"the cloud has {len(cloud)} points; at least {_FEWEST_POINTS} are needed for a pipe")
-    part = find_straight_pipe(cloud, largest_ovality=largest_ovality)
-    form = part.form
+    form, left_out, regions = find_straight_pipe(cloud, largest_ovality=largest_ovality)
     of_size = _check_size(2 * form.radius_mm, wall_mm)
     on_pipe = np.abs(form.distance_mm) < _OFF_SURFACE * form.radius_mm
     off = []
-    if stray := np.count_nonzero(is_off := ~(on_pipe | part.left_out)):
+    if stray := np.count_nonzero(is_off := ~(on_pipe | left_out)):
         inside, limit = np.count_nonzero(is_off & (form.distance_mm < 0)), _OFF_SURFACE * form.radius_mm
         off.append(
             f"{stray} of {len(cloud)} points are {limit:.2g} mm or more off the pipe ({inside} inside) and are "
             "omitted: a finding beside them is not seen whole"
         )
-    chosen = np.flatnonzero(on_pipe & ~part.left_out)
+    chosen = np.flatnonzero(on_pipe & ~left_out)
     welds = find_welds(form, chosen)
     on_weld = np.any([weld.covers for weld in welds], axis=0) if welds else np.zeros(len(cloud), bool)
     chosen = chosen[~on_weld[chosen]]
@@ -131,7 +130,7 @@ def inspect_pipe(
     deviation, level = np.full(len(cloud), np.nan), np.full(len(cloud), np.nan)
     deviation[chosen[~search.outliers]] = form.distance_mm[chosen[~search.outliers]]
     level[chosen] = search.level_mm
-    notes = *part.notes, *_note_limits(cloud, form, search), *of_size, *off, *of_sections, *on_welds, *of_blemishes
+    notes = *regions, *_note_limits(cloud, form, search), *of_size, *off, *of_sections, *on_welds, *of_blemishes
     found = Inspection("pipe", (*features, *of_welds, *blemishes), deviation, level, notes)
     return found.consider_cloud(cloud)
 

@@ -63,12 +63,6 @@ class PipeFrame:
     point_mm: np.ndarray  # (3,); point on the axis
     axes: np.ndarray  # (3, 3); unit vectors in rows: two directions across, and the axis
 
-    @classmethod
-    def about(cls, cylinder: Cylinder, points_mm: np.ndarray) -> PipeFrame:
-        """Return the frame of a cylinder, with its point in the middle of points (N, 3)."""
-        point, axis = cylinder.point_mm, cylinder.axis
-        return cls(point + axis * np.median((points_mm - point) @ axis), np.array([*cylinder.across, axis]))
-
     def shift_and_tilt(self, shift: np.ndarray, slopes: np.ndarray) -> PipeFrame:
         """Return the frame shifted by (2,) mm, with its axis tilted by slopes (2,), along the directions across."""
         across = self.axes[:2]
@@ -134,7 +128,10 @@ def fit_pipe(cloud: PointCloud, *, largest_ovality: float = LARGEST_OVALITY, sta
     fitted = thin_evenly(np.arange(len(cloud)), FORM_RULE.most_points)
     points = cloud.points_mm[fitted]
     start = start or fit_robustly(Cylinder.fit, thin_evenly(points, FORM_RULE.start_points)).fit
-    return _fit_from(cloud, fitted, PipeFrame.about(start, points), start.radius_mm, largest_ovality)
+    point, axis = start.point_mm, start.axis
+    # The frame's point is in the middle of the points.
+    frame = PipeFrame(point + axis * np.median((points - point) @ axis), np.array([*start.across, axis]))
+    return _fit_from(cloud, fitted, frame, start.radius_mm, largest_ovality)
 
 
 def refit_pipe(cloud: PointCloud, form: PipeForm, *, left_out: np.ndarray) -> PipeForm:

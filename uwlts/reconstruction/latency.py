@@ -54,7 +54,7 @@ def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s:
     backward = _Surface.from_centres(stage_mm[back], centre_px[back])
     speed = float(np.median(speed_mm_per_s[there]) - np.median(speed_mm_per_s[back])) / 2
     # A backward frame at x shows the same as the forward pass at x - 2 v latency.
-    step = surface.step_mm / 2
+    step = float(np.median(np.diff(surface.position))) / 2
     reach = int(np.ceil(2 * speed * _LARGEST_S / step))
     ways = step * np.arange(-reach, reach + 1)
     ways = ways[np.argsort(np.abs(ways), kind="stable")]
@@ -118,11 +118,6 @@ class _Surface:
         smooth = odd < np.maximum(_MOST_BENT_PX, _MOST_BENT * np.abs(across) / 2)
         slope[1:-1] = np.where(smooth, across / apart[:, None], np.nan)
         return cls(position, centre, slope)
-
-    @property
-    def step_mm(self) -> float:
-        """Median distance between frames, mm."""
-        return float(np.median(np.diff(self.position)))
 
     def compare(self, other: "_Surface", shift: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Compare the centres of another pass at x with those of this pass at x - shift.
