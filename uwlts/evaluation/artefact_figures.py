@@ -59,6 +59,7 @@ class SphereEvaluation(ArtefactEvaluation):
     artefact: SphereStandard
     spheres: tuple[SphereResult, ...]
     spacings: tuple[SpacingResult, ...]
+    labels: np.ndarray  # (N,) int; number, from 0, of the sphere of each used point; -1 for others
 
     @property
     def pe_mm(self) -> float:
@@ -82,7 +83,7 @@ def evaluate_spheres(points: np.ndarray, artefact: SphereStandard) -> SphereEval
     EvaluationError for missing spheres, or for hollow spheres, which indicate rotated images.
     """
     found = _sort_spheres(_find_spheres(points, artefact, np.random.default_rng(0)), artefact)
-    deviation = np.full(len(points), np.nan)
+    deviation, labels = np.full(len(points), np.nan), np.full(len(points), -1)
     spheres, fits = [], []
     for sphere, diameter in zip(found, artefact.diameters_mm, strict=True):
         members, robust = _fit_cap(points, sphere, artefact.cap_angle_deg)
@@ -92,7 +93,7 @@ def evaluate_spheres(points: np.ndarray, artefact: SphereStandard) -> SphereEval
                 "the spheres are hollow: their points are behind their centres, where the sensor cannot see them. The "
                 "images may be rotated by 180 deg or mirrored relative to those of the calibration"
             )
-        deviation[used] = fit.residuals_mm
+        deviation[used], labels[used] = fit.residuals_mm, len(fits)
         fits.append((fit, Sphere.fit(points[used], diameter / 2)))
         spheres.append(
             SphereResult(
@@ -123,6 +124,7 @@ def evaluate_spheres(points: np.ndarray, artefact: SphereStandard) -> SphereEval
         deviation_mm=deviation,
         spheres=tuple(spheres),
         spacings=tuple(spacings),
+        labels=labels,
         points_excluded=sum(len(sphere.members) for sphere in found) - sum(counts),
     )
 

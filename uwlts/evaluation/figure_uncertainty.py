@@ -151,11 +151,7 @@ def _linearise_step(cloud: PointCloud, evaluation: StepEvaluation) -> Linearised
 
 def _linearise_spheres(points: np.ndarray, evaluation: SphereEvaluation) -> LinearisedFigures:
     artefact = evaluation.artefact
-    used = np.flatnonzero(np.isfinite(evaluation.deviation_mm))
-    centres = np.array([sphere.centre_mm for sphere in evaluation.spheres])
-    radii = np.array([sphere.diameter_mm for sphere in evaluation.spheres]) / 2
-    off = np.abs(np.linalg.norm(points[used, None] - centres, axis=2) - radii)
-    members = [used[np.argmin(off, axis=1) == number] for number in range(len(radii))]
+    members = [np.flatnonzero(evaluation.labels == number) for number in range(len(evaluation.spheres))]
     free, known = (
         [
             LinearisedFit(Sphere.fit(points[own], radius), points, own)

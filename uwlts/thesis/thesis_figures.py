@@ -90,17 +90,14 @@ def sphere_scan(capture: Capture, calibration: AnyCalibration) -> SphereScan:
     stripes = find_stripes(capture)
     scan = reconstruct_stripes(capture, stripes, calibration)
     evaluation = evaluate_spheres(scan.points_mm, standard)
-    centres = np.array([sphere.centre_mm for sphere in evaluation.spheres])
-    radii = np.array(standard.diameters_mm) / 2
-    used = np.isfinite(evaluation.deviation_mm)
-    away = np.abs(np.linalg.norm(scan.points_mm[used, None] - centres, axis=2) - radii)
+    used = evaluation.labels >= 0
     lines = int(stripes.line.max()) + 1
     kept = np.flatnonzero(np.isin(lines * stripes.frame + stripes.line, (lines * scan.frame + scan.line)[used]))
     line, centre = stripes.line[kept], stripes.centre_px[kept]
     return SphereScan(
         pixels=stack_pixels(line, centre, stripe_along=capture.header.sensor.camera.stripe_along),
         stage_mm=capture.stage_mm[stripes.frame[kept]],
-        sphere=np.argmin(away, axis=1),
+        sphere=evaluation.labels[used],
         stage_direction=np.array(capture.header.stage_direction),
         medium_index=capture.header.medium.refractive_index(capture.header.sensor.laser.wavelength_nm),
         spacing_mm=standard.spacings_mm[0],
