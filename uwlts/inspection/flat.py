@@ -554,20 +554,17 @@ def _measure_flush(cloud: PointCloud, face: _Face, plates: list[np.ndarray], mid
     """Return the offset of two plates along the normal at a place between them."""
     if min(map(len, plates)) < _Rule.fewest_points:
         raise EvaluationError(f"the smaller plate has {min(map(len, plates))} points; {_Rule.fewest_points} are needed")
-    parts, used, residuals = [], [], []
+    parts = []
     for sign, chosen in zip((-1.0, 1.0), plates, strict=True):
         local = (cloud.points_mm[chosen] - face.point_mm) @ face.axes.T
-        near = np.abs(local[:, 2] - np.median(local[:, 2])) < _Rule.off_face * max(
-            robust_std(local[:, 2] - np.median(local[:, 2])), 1e-9
-        )
+        off = local[:, 2] - np.median(local[:, 2])
+        near = np.abs(off) < _Rule.off_face * max(robust_std(off), 1e-9)
         chosen, local = chosen[near], local[near]
         design = np.column_stack([np.ones(len(local)), local[:, :2] - middle])
         rows = np.linalg.solve(design.T @ design, design.T)
-        parts.append(sign * rows[0])
-        used.append(chosen)
-        residuals.append(local[:, 2] - design @ (rows @ local[:, 2]))
-    both, weights = np.concatenate(used), np.concatenate(parts)[None]
-    offset = float(weights[0] @ ((cloud.points_mm[both] - face.point_mm) @ face.axes[2]))
+        parts.append((sign * rows[0], chosen, local[:, 2] - design @ (rows @ local[:, 2])))
+    weights, both, residuals = (np.concatenate(each) for each in zip(*parts, strict=True))
+    offset = float(weights @ ((cloud.points_mm[both] - face.point_mm) @ face.axes[2]))
     errors = PointErrors.along_normals(cloud, both, np.broadcast_to(face.axes[2], (len(both), 3)))
-    known = errors.covariances(weights, np.concatenate(residuals), group_neighbours(len(both)))
+    known = errors.covariances(weights[None], residuals, group_neighbours(len(both)))
     return linear_value(FeatureKind.GAP, "flush", abs(offset), known, np.ones(1), least=0.0)
