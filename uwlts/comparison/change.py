@@ -23,7 +23,7 @@ from uwlts.comparison.change_reference import (
     select_seen_side,
     stated_variance,
 )
-from uwlts.comparison.local_means import OPTIONS, TWO_SIDED, LocalMeans, average_locally
+from uwlts.comparison.local_means import OPTIONS, TWO_SIDED, average_locally
 from uwlts.errors import EvaluationError
 from uwlts.fitting.local_surface import choose_disc_diameter, number_cubes
 from uwlts.model.sensor import Table
@@ -282,6 +282,7 @@ def compare_clouds(
     for name, length in (("disc_mm", disc_mm), ("deep_mm", deep_mm)):
         if length is not None and not 0 < length < np.inf:
             raise EvaluationError(f"{name} is {length:g}; expected a positive length in mm")
+    sample = SurfaceSample(new.points_mm, new.uncertainty, new.frame)
     disc = disc_mm or choose_disc_diameter(require_enough(new.points_mm, "cloud"), new.frame)
     surface = read_reference(reference, unit=reference_unit, disc_mm=disc)
     exact = not isinstance(surface, SurfaceSample) or surface.meshed or surface.uncertainty is not None
@@ -297,10 +298,10 @@ def compare_clouds(
     deep = deep_mm or OPTIONS.depth_per_disc * disc
     if isinstance(surface, SurfaceSample):
         sides = _compare_with_points(
-            new, surface, fixed, register=register, disc=disc, deep=deep, same_water=same_water
+            sample, surface, fixed, register=register, disc=disc, deep=deep, same_water=same_water
         )
     else:
-        sides = _compare_with_shape(new, surface, fixed, register=register, disc=disc, deep=deep)
+        sides = _compare_with_shape(sample, surface, fixed, register=register, disc=disc, deep=deep)
     variance, found = sides.variance_mm2, sides.registration
     if found is not None:
         variance = variance + found.std_along(sides.places, sides.normals) ** 2
@@ -349,7 +350,7 @@ class _Distances:
 
 
 def _compare_with_points(
-    new: PointCloud,
+    cloud: SurfaceSample,
     surface: SurfaceSample,
     datums: np.ndarray | None,
     *,
@@ -358,30 +359,27 @@ def _compare_with_points(
     deep: float,
     same_water: bool,
 ) -> _Distances:
-    points, known, other, found = new.points_mm, new.uncertainty, surface.uncertainty, None
-    chosen, apart = _thin_points(points, disc / 2)
     depths: float | np.ndarray = deep
+    chosen, apart = _thin_points(cloud.points_mm, disc / 2)
     if surface.normals is not None:
         seen, depths = select_seen_side(
-            points[chosen], surface.points_mm, surface.normals, deep_mm=deep, apart_mm=apart
+            cloud.points_mm[chosen], surface.points_mm, surface.normals, deep_mm=deep, apart_mm=apart
         )
         surface = replace(surface, points_mm=surface.points_mm[seen], normals=surface.normals[seen])
-    if register:
-        found = register_to_surface(SurfaceSample(points, known, new.frame), surface, reach_mm=deep, datums=datums)
-        points, known = _move_points(points, known, found)
-        if other is not None:
+    found = register_to_surface(cloud, surface, reach_mm=deep, datums=datums) if register else None
+    if found is not None:
+        cloud = _move_cloud(cloud, found)
+        if surface.uncertainty is not None:
             # The registration follows systematic errors of the reference.
-            followed = [found.moves_mm(step, surface.points_mm) for step in found.by_reference]
-            other = replace(other, patterns_mm=other.patterns_mm - np.array(followed, np.float32))
-    places = points[chosen]
+            followed = found.follow(surface.uncertainty, -found.by_reference, surface.points_mm)
+            surface = replace(surface, uncertainty=followed)
+    places = cloud.points_mm[chosen]
     normals = fit_local_normals(places, surface.points_mm, disc_mm=disc, given=surface.normals)
-    here = average_locally(places, normals, points, uncertainty=known, frame=new.frame, disc_mm=disc, deep_mm=depths)
-    there = average_locally(
-        places, normals, surface.points_mm, uncertainty=other, frame=surface.frame, disc_mm=disc, deep_mm=depths
-    )
+    here, there = (average_locally(places, normals, each, disc_mm=disc, deep_mm=depths) for each in (cloud, surface))
     # The samples of a mesh are exact, so their scatter is no noise.
     variance = here.variance_mm2 + (0.0 if surface.meshed else there.variance_mm2)
     variance += np.sum(here.patterns_mm**2, axis=1) + np.sum(there.patterns_mm**2, axis=1)
+    known, other = cloud.uncertainty, surface.uncertainty
     if known is not None and other is not None:
         for name in known.shared.keys() & other.shared.keys():
             if same_water or not name.startswith(WATER):
@@ -392,41 +390,29 @@ def _compare_with_points(
 
 
 def _compare_with_shape(
-    new: PointCloud, shape: IdealShape, datums: np.ndarray | None, *, register: bool, disc: float, deep: float
+    cloud: SurfaceSample, shape: IdealShape, datums: np.ndarray | None, *, register: bool, disc: float, deep: float
 ) -> _Distances:
-    points, known, fitted = new.points_mm, new.uncertainty, shape.point_mm is None
+    fitted = shape.point_mm is None
     if datums is not None and not (register or fitted):
         raise EvaluationError(
             "datums were given without a registration, and this shape has a given position; set `register`"
         )
-    chosen = slice(None) if datums is None or not fitted else select_within(points, datums)
-    placed = place_shape(
-        shape, points[chosen], uncertainty=None if known is None else known[chosen], frame=new.frame[chosen]
-    )
+    chosen = slice(None) if datums is None or not fitted else select_within(cloud.points_mm, datums)
+    placed = place_shape(shape, cloud.select(chosen))
     found, moved = placed.registration, None
-    if found is not None and known is not None:
-        followed = [found.moves_mm(step, points, placed.nearest(points)[1]) for step in found.by_cloud]
-        known = replace(known, patterns_mm=known.patterns_mm + np.array(followed, np.float32))
+    if found is not None and cloud.uncertainty is not None:
+        normals = placed.nearest(cloud.points_mm)[1]
+        cloud = replace(cloud, uncertainty=found.follow(cloud.uncertainty, found.by_cloud, cloud.points_mm, normals))
     elif found is None and register:
-        distance, normals = placed.nearest(points, reach_mm=deep)
-        below = points - distance[:, None] * normals
+        distance, normals = placed.nearest(cloud.points_mm, reach_mm=deep)
+        below = cloud.points_mm - distance[:, None] * normals
         target = SurfaceSample(below[np.isfinite(distance)])
-        found = moved = register_to_surface(
-            SurfaceSample(points, known, new.frame), target, reach_mm=deep, datums=datums
-        )
-        points, known = _move_points(points, known, found)
-    spread, apart = _thin_points(points, disc / 2)
-    places = points[spread]
-    here: LocalMeans = average_locally(
-        places,
-        normals := placed.nearest(places)[1],
-        points,
-        distance_mm=placed.nearest(points, reach_mm=deep)[0],
-        uncertainty=known,
-        frame=new.frame,
-        disc_mm=disc,
-        deep_mm=deep,
-    )
+        found = moved = register_to_surface(cloud, target, reach_mm=deep, datums=datums)
+        cloud = _move_cloud(cloud, found)
+    spread, apart = _thin_points(cloud.points_mm, disc / 2)
+    places = cloud.points_mm[spread]
+    normals, distance = placed.nearest(places)[1], placed.nearest(cloud.points_mm, reach_mm=deep)[0]
+    here = average_locally(places, normals, cloud, distance_mm=distance, disc_mm=disc, deep_mm=deep)
     variance = here.variance_mm2 + np.sum(here.patterns_mm**2, axis=1)
     reference = placed.describe() + placed.note_misfit(places, here.mean_mm, variance)
     return _Distances(places, apart, normals, here.mean_mm, variance, found, moved, reference)
@@ -455,18 +441,13 @@ def _thin_points(points: np.ndarray, apart: float) -> tuple[np.ndarray, float]:
         apart *= max(np.sqrt(len(first) / OPTIONS.most_places), 1.02)
 
 
-def _move_points(
-    points: np.ndarray, known: PointUncertainty | None, found: Registration
-) -> tuple[np.ndarray, PointUncertainty | None]:
-    """Move points by a registration; its response to systematic errors is added to their patterns."""
-    rotation = found.transform[:3, :3]
-    points = points @ rotation.T + found.transform[:3, 3]
+def _move_cloud(cloud: SurfaceSample, found: Registration) -> SurfaceSample:
+    """Move a cloud by a registration; its response to systematic errors is added to their patterns."""
+    rotation, known = found.transform[:3, :3], cloud.uncertainty
+    points = cloud.points_mm @ rotation.T + found.transform[:3, 3]
     if known is None:
-        return points, None
-    patterns = known.patterns_mm @ rotation.T
-    followed = [found.moves_mm(step, points) for step in found.by_cloud]
-    patterns = patterns + np.array(followed, np.float32).reshape(patterns.shape)
+        return replace(cloud, points_mm=points)
     poses = None if known.poses_mm is None else known.poses_mm @ rotation.T
-    position = known.position_mm @ rotation.T
-    random = rotate_covariances(known.random_mm2, rotation)
-    return points, PointUncertainty(random, position, patterns.astype(np.float32), poses, known.shared)
+    turned = rotate_covariances(known.random_mm2, rotation), known.position_mm @ rotation.T
+    known = PointUncertainty(*turned, known.patterns_mm @ rotation.T, poses, known.shared)
+    return replace(cloud, points_mm=points, uncertainty=found.follow(known, found.by_cloud, points))

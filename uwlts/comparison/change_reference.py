@@ -24,7 +24,7 @@ from uwlts.registration.surface_registration import Registration, SurfaceSample,
 from uwlts.shapes.cylinder import Cylinder
 from uwlts.shapes.flat import Plane
 from uwlts.shapes.sphere import Sphere
-from uwlts.storage.cloud import PointCloud, PointUncertainty, rounding_std_mm
+from uwlts.storage.cloud import PointCloud, rounding_std_mm
 from uwlts.storage.cloud_files import is_readable_cloud, load_cloud
 from uwlts.storage.mesh_file import has_faces, load_triangles
 from uwlts.storage.number_tables import MM_PER_UNIT, Unit
@@ -158,10 +158,8 @@ class PlacedShape:
         return f"{self.kind}{size} at ({place}) mm{way}{'' if self.registration is None else ', fitted'}"
 
 
-def place_shape(
-    shape: IdealShape, points_mm: np.ndarray, *, uncertainty: PointUncertainty | None, frame: np.ndarray
-) -> PlacedShape:
-    """Return a given shape, or fit it robustly to points (N, 3) of images ``frame`` (N,).
+def place_shape(shape: IdealShape, cloud: SurfaceSample) -> PlacedShape:
+    """Return a given shape, or fit it robustly to the points of a cloud.
 
     EvaluationError if the points do not determine the shape.
     """
@@ -170,8 +168,8 @@ def place_shape(
         way = getattr(shape, shape.way, None)
         direction = None if way is None else np.array(way, float) / np.linalg.norm(way)
         return PlacedShape(shape.kind, np.array(shape.point_mm, float), direction, radius or 0.0)
-    chosen = thin_evenly(np.arange(len(points_mm)), _MOST_FITTED)
-    points = points_mm[chosen]
+    chosen = thin_evenly(np.arange(len(cloud.points_mm)), _MOST_FITTED)
+    points = cloud.points_mm[chosen]
     match shape:
         case IdealPlane():
             robust = fit_robustly(Plane.fit, points, towards=TOWARDS_SENSOR)
@@ -185,12 +183,8 @@ def place_shape(
             placed = PlacedShape(shape.kind, robust.fit.point_mm, robust.fit.axis, robust.fit.radius_mm)
         case _:
             assert_never(shape)
-    used = chosen[robust.inliers]
-    known = None if uncertainty is None else uncertainty[used]
-    near = placed.nearest(points_mm[used])
-    registration = shape_registration(
-        points_mm[used], *near, sized=radius is None, uncertainty=known, frame=frame[used]
-    )
+    used = cloud.select(chosen[robust.inliers])
+    registration = shape_registration(used, *placed.nearest(used.points_mm), sized=radius is None)
     return replace(placed, registration=registration)
 
 

@@ -6,7 +6,7 @@ motion are absorbed by the registration, so their effect on the estimated motion
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -77,6 +77,14 @@ class Registration:
         moved = step[:3] + np.cross(step[3:6], points_mm - self.middle_mm)
         return moved if normals is None or len(step) == 6 else moved + step[6] * normals
 
+    def follow(
+        self, known: PointUncertainty, steps: np.ndarray, points_mm: np.ndarray, normals: np.ndarray | None = None
+    ) -> PointUncertainty:
+        """Return an uncertainty of points (N, 3) whose patterns contain a step of the motion for each (M, 6)."""
+        moves = [self.moves_mm(step, points_mm, normals) for step in steps]
+        patterns = known.patterns_mm + np.array(moves, np.float32).reshape(known.patterns_mm.shape)
+        return replace(known, patterns_mm=patterns.astype(np.float32))
+
 
 def register_to_surface(
     cloud: SurfaceSample, reference: SurfaceSample, *, reach_mm: float, datums: np.ndarray | None = None
@@ -121,19 +129,13 @@ def register_to_surface(
 
 
 def shape_registration(
-    points_mm: np.ndarray,
-    distance_mm: np.ndarray,
-    normals: np.ndarray,
-    *,
-    sized: bool,
-    uncertainty: PointUncertainty | None,
-    frame: np.ndarray,
+    cloud: SurfaceSample, distance_mm: np.ndarray, normals: np.ndarray, *, sized: bool
 ) -> Registration:
     """Return the uncertainty of a shape that was fitted to points by least squares, as a zero registration.
 
-    Points (N, 3) of images ``frame`` (N,) have distances (N,) from the shape along its normals (N, 3). ``sized``: the
-    radius was fitted, too.
+    The points have distances (N,) from the shape along its normals (N, 3). ``sized``: the radius was fitted, too.
     """
+    points_mm, uncertainty = cloud.points_mm, cloud.uncertainty
     middle = points_mm.mean(axis=0)
     by = _motion_derivatives(points_mm, normals, middle, sized=sized)
     # Rotations are scaled by the rms radius, so that all unknowns are lengths.
@@ -143,7 +145,8 @@ def shape_registration(
     answer = -units[:, None] * (vectors[:, known] / values[known]) @ vectors[:, known].T @ (by * units).T
     covariance, patterns = np.mean(distance_mm**2) * answer @ answer.T, np.empty((0, len(answer)))
     if uncertainty is not None:
-        covariance = covariance + grouped_covariance(answer, project_image_errors(uncertainty, normals), frame)
+        images = np.arange(len(points_mm)) if cloud.frame is None else cloud.frame
+        covariance = covariance + grouped_covariance(answer, project_image_errors(uncertainty, normals), images)
         patterns = np.einsum("mni,ni->mn", uncertainty.patterns_mm, normals) @ answer.T
     rms = float(np.sqrt(np.mean(distance_mm**2)))
     none = np.empty((0, len(answer)))

@@ -477,16 +477,16 @@ def test_regions_and_figures_are_those_of_the_places():
 def test_ideal_shapes_have_their_distances_and_normals():
     """Signed distances along unit normals; also in the centre of a sphere, where no normal is defined."""
     places = np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 2.0], [0.0, 0.0, 0.0]])
-    given = {"uncertainty": None, "frame": np.zeros(3)}
-    distance, normals = place_shape(IdealSphere(diameter_mm=6.0, point_mm=(0, 0, 0)), places, **given).nearest(places)
+    given = SurfaceSample(places)
+    distance, normals = place_shape(IdealSphere(diameter_mm=6.0, point_mm=(0, 0, 0)), given).nearest(places)
     np.testing.assert_allclose(distance, [2.0, -1.0, -3.0])
     np.testing.assert_allclose(normals, [[0.6, 0.8, 0], [0, 0, 1], [0, 0, 0]])
     pipe = IdealCylinder(diameter_mm=6.0, point_mm=(0, 0, 7), axis=(0, 0, -3))
-    distance, normals = place_shape(pipe, places, **given).nearest(places, reach_mm=2.5)
+    distance, normals = place_shape(pipe, given).nearest(places, reach_mm=2.5)
     np.testing.assert_allclose(distance, [2.0, np.nan, np.nan])
     np.testing.assert_allclose(normals[0], [0.6, 0.8, 0])
     plane = IdealPlane(point_mm=(0, 0, 1), normal=(0, 3, 4))
-    distance, normals = place_shape(plane, places, **given).nearest(places)
+    distance, normals = place_shape(plane, given).nearest(places)
     np.testing.assert_allclose(distance, [2.4 - 0.8, 0.8, -0.8])
     np.testing.assert_allclose(normals, [[0, 0.6, 0.8]] * 3)
 
