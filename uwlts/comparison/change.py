@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import asdict, dataclass, replace
+from itertools import chain
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -20,6 +21,7 @@ from uwlts.comparison.change_reference import (
     read_reference,
     require_enough,
     require_same_unit,
+    sample_cloud,
     select_seen_side,
     stated_variance,
 )
@@ -29,7 +31,7 @@ from uwlts.fitting.local_surface import choose_disc_diameter, number_cubes
 from uwlts.model.sensor import Table
 from uwlts.model.short_text import Brief
 from uwlts.registration.surface_registration import Registration, SurfaceSample, register_to_surface, select_within
-from uwlts.storage.cloud import WATER, PointCloud, PointUncertainty, rotate_covariances, rounding_std_mm
+from uwlts.storage.cloud import WATER, PointCloud, PointUncertainty, rotate_covariances
 from uwlts.storage.cloud_files import load_cloud
 from uwlts.storage.pose_files import Unit
 
@@ -282,7 +284,7 @@ def compare_clouds(
     for name, length in (("disc_mm", disc_mm), ("deep_mm", deep_mm)):
         if length is not None and not 0 < length < np.inf:
             raise EvaluationError(f"{name} is {length:g}; expected a positive length in mm")
-    sample = SurfaceSample(new.points_mm, new.uncertainty, new.frame)
+    sample = sample_cloud(new)
     disc = disc_mm or choose_disc_diameter(require_enough(new.points_mm, "cloud"), new.frame)
     surface = read_reference(reference, unit=reference_unit, disc_mm=disc)
     exact = not isinstance(surface, SurfaceSample) or surface.meshed or surface.uncertainty is not None
@@ -306,10 +308,8 @@ def compare_clouds(
     if found is not None:
         variance = variance + found.std_along(sides.places, sides.normals) ** 2
     # Rounding errors of neighbouring points are equal where a surface is parallel to an axis, and do not average out.
-    stored, read = 0.0, ()
-    if isinstance(surface, SurfaceSample):
-        stored, read = surface.rounding_std_mm, surface.warnings
-    variance = variance + rounding_std_mm(new) ** 2 + stored**2 + own + other
+    samples = [sample, surface] if isinstance(surface, SurfaceSample) else [sample]
+    variance = variance + sum(each.rounding_std_mm**2 for each in samples) + own + other
     if not np.isfinite(sides.distance_mm).any():
         raise EvaluationError(
             f"the cloud and the reference do not overlap within {deep:g} mm. Check that both have the same frame and "
@@ -327,7 +327,7 @@ def compare_clouds(
         deep,
         sides.moved,
         sides.reference,
-        tuple(dict.fromkeys([*new.warnings, *read, *own_warnings, *other_warnings])),
+        tuple(dict.fromkeys([*chain(*(each.warnings for each in samples)), *own_warnings, *other_warnings])),
         (cloud_std_mm, reference_std_mm),
     )
 

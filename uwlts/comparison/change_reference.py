@@ -326,7 +326,7 @@ def read_reference(reference: Reference, *, unit: Unit | None, disc_mm: float) -
         if path.suffix.lower() == ".toml":
             reference = read_shape(path)
         elif path.suffix.lower() == ".h5" or (is_readable_cloud(path) and not has_faces(path)):
-            return _points_of(load_cloud(path, unit=unit), 1.0)
+            return sample_cloud(load_cloud(path, unit=unit))
         else:
             mesh = load_triangles(path, unit=unit)
             return sample_mesh(np.asarray(mesh.vertices, float), np.asarray(mesh.faces), disc_mm=disc_mm)
@@ -334,10 +334,10 @@ def read_reference(reference: Reference, *, unit: Unit | None, disc_mm: float) -
         return reference
     if scale != 1.0 and reference.uncertainty is not None:
         raise EvaluationError("the unit is m, but clouds with uncertainty are always in mm; omit the unit")
-    return _points_of(load_cloud(reference), scale)
+    return sample_cloud(load_cloud(reference), scale)
 
 
-def _points_of(cloud: PointCloud, scale: float) -> SurfaceSample:
+def sample_cloud(cloud: PointCloud, scale: float = 1.0) -> SurfaceSample:
     points, rounding = scale * cloud.points_mm, scale * rounding_std_mm(cloud)
     return SurfaceSample(points, cloud.uncertainty, cloud.frame, None, rounding, tuple(cloud.warnings))
 
