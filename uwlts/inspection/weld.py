@@ -118,10 +118,10 @@ def inspect_weld(cloud: PointCloud | str | os.PathLike[str], *, section_mm: floa
     local = (cloud.points_mm - middle) @ axes.T
     local[(local[:, 0] < ends[0]) | (local[:, 0] > ends[1])] = np.inf
     tangents = np.broadcast_to(axes[:2], (len(cloud), 2, 3))
-    bead = build_bead(cloud, local, axes, middle, tangents, half_mm=half, section_mm=section_mm)
-    errors = PointErrors.along_normals(cloud, bead.chosen, np.broadcast_to(bead.axes[2], (len(bead.chosen), 3)))
+    bead = build_bead(cloud, local, tangents, half_mm=half, section_mm=section_mm)
+    errors = PointErrors.along_normals(cloud, bead.chosen, np.broadcast_to(axes[2], (len(bead.chosen), 3)))
     values, extent, left_out = measure_bead(bead, errors)
-    feature = Feature(FeatureKind.WELD, "weld", values, bead.middle_mm, bead.axes, extent, bead.chosen[bead.on_bead])
+    feature = Feature(FeatureKind.WELD, "weld", values, middle, axes, extent, bead.chosen[bead.on_bead])
     deviation = np.full(len(cloud), np.nan)
     deviation[bead.chosen] = bead.heights_mm
     count = bead.profiles.sections
@@ -138,8 +138,6 @@ def inspect_weld(cloud: PointCloud | str | os.PathLike[str], *, section_mm: floa
 class Bead:
     """Bead with its plates."""
 
-    axes: np.ndarray  # (3, 3); unit vectors along the bead, across it and outwards
-    middle_mm: np.ndarray  # (3,); middle of the bead
     chosen: np.ndarray  # (n,) int; points on the bead and on the plates
     raw_mm: np.ndarray  # (n,); heights of these points above the middle
     heights_mm: np.ndarray  # (n,); heights of these points above the plates
@@ -153,21 +151,13 @@ class Bead:
 
 
 def build_bead(
-    cloud: PointCloud,
-    local: np.ndarray,
-    axes: np.ndarray,
-    middle: np.ndarray,
-    tangents: np.ndarray,
-    *,
-    half_mm: float,
-    section_mm: float | None = None,
+    cloud: PointCloud, local: np.ndarray, tangents: np.ndarray, *, half_mm: float, section_mm: float | None = None
 ) -> Bead:
     """Return a bead with its plates and profiles.
 
     ``local`` (N, 3) are places along the bead, across it and heights, mm; not finite for points that do not count.
-    ``axes`` (3, 3) are unit vectors along the bead, across it and outwards in its ``middle`` (3,); ``tangents`` (N, 2,
-    3) those along and across at the points. ``half_mm`` is the approximate half width, ``section_mm`` the length of a
-    section.
+    ``tangents`` (N, 2, 3) are unit vectors along and across it at the points. ``half_mm`` is the approximate half
+    width, ``section_mm`` the length of a section.
 
     Raises EvaluationError if the points do not show the plates on both sides of the bead.
     """
@@ -214,7 +204,7 @@ def build_bead(
     scatter = _local_scatter(profiles, raw, across, bandwidth)
     seen = seen * np.maximum(scatter / float(np.median(scatter[np.abs(across) > half * (1 + _Rule.groove_outside)])), 1)
     on_bead = np.abs(across) < half
-    return Bead(axes, middle, chosen, raw, heights, on_bead, half, length, gap, seen, profiles, footprint_std)
+    return Bead(chosen, raw, heights, on_bead, half, length, gap, seen, profiles, footprint_std)
 
 
 def _local_scatter(profiles: BeadProfiles, raw: np.ndarray, across: np.ndarray, bandwidth: float) -> np.ndarray:
