@@ -40,7 +40,6 @@ from uwlts.inspection.features import SEED
 class Indication:
     """Significant departure of a surface from its shape."""
 
-    place: np.ndarray  # (2,); middle, mm
     radius_mm: float  # radius of the bell
     height_mm: float  # signed height
     z: float  # height in standard deviations
@@ -69,7 +68,6 @@ class BlemishSearch:
     outliers: np.ndarray  # (N,) bool
     undamaged: np.ndarray  # (N,) bool; points that are neither outliers nor in an indication
     level_mm: np.ndarray  # (N,); least significant height of an indication of the smallest size
-    noise_mm: np.ndarray  # (N,); effective noise of each point
     smallest_mm: float  # smallest radius of the search
     gap_mm: float  # distance from all points, from which a place is not seen
     threshold: float  # least significant z
@@ -134,19 +132,18 @@ def search_blemishes(surface: UnrolledSurface, *, false_alarm: float, largest_mm
                 outcome = UnresolvedDeparture(int(tree.query(peak.place)[1]), peak.height, bound, str(error))
             found.append(_Candidate(peak, outcome, points))
             undamaged[points] = False
-    level, noise = np.full(len(places), np.nan), np.full(len(places), np.nan)
+    level = np.full(len(places), np.nan)
     if maps:
         tail, found = _confirm(surface, undamaged, maps[0], threshold, found)
         level = tail.scatter_at(threshold) * maps[0].level_at(places)
-        noise = maps[0].noise_at(places)
     small = _assign_outliers(seen, outliers, found, together, false_alarm)
     kept: list[Indication] = []
     for peak, outcome, points in found:
         if isinstance(outcome, float):
             chance = min(1.0, sum(each.false_alarms(peak.z) for each in maps))
-            kept.append(Indication(peak.place, peak.radius, peak.height, peak.z, chance, wider * outcome, points))
+            kept.append(Indication(peak.radius, peak.height, peak.z, chance, wider * outcome, points))
     departures = [each.outcome for each in found if isinstance(each.outcome, UnresolvedDeparture)]
-    known = tuple(kept), (*departures, *small), outliers, undamaged, level, wider * noise
+    known = tuple(kept), (*departures, *small), outliers, undamaged, level
     return BlemishSearch(*known, smallest, gap, threshold, false_alarm)
 
 

@@ -209,7 +209,6 @@ def _join_copies(search: BlemishSearch, copied: np.ndarray, count: int) -> Blemi
         outliers=search.outliers[:count],
         undamaged=undamaged,
         level_mm=search.level_mm[:count],
-        noise_mm=search.noise_mm[:count],
     )
 
 

@@ -206,5 +206,6 @@ def find_line(points: np.ndarray, rng: np.random.Generator) -> ProfileLine | Non
 
     if (found := _refit_inliers(members, tolerance, lambda some: Line.fit(points[some]).distances_mm(points))) is None:
         return None
-    line = Line.fit(points[found[0]])
-    return ProfileLine(members=found[0], std_mm=found[1], middle_mm=line.point_mm, direction=line.direction)
+    members, std = found
+    line = Line.fit(points[members])
+    return ProfileLine(members=members, std_mm=std, middle_mm=line.point_mm, direction=line.direction)
