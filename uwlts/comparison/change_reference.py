@@ -43,7 +43,7 @@ class _Shape(Description):
 
     way: ClassVar[str] = ""
 
-    kind: str
+    kind: Any  # the literal of each shape
     point_mm: Vector | None = None
 
     @property

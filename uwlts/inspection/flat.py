@@ -381,7 +381,8 @@ def _measure_flatness(cloud: PointCloud, face: _Face, used: np.ndarray) -> Featu
     drawn = [changed(moves) for moves in noisy.draw(_Rule.draws)]
     increase, common = max(float(np.mean(drawn)), 0.0), errors.by_patterns(changed)
     flatness, random = max(value - BIAS_FACTOR * increase, 0.0), float(np.hypot(np.std(drawn), increase))
-    return plain_value(FeatureKind.FLANGE, "flatness", flatness, random, common, least=0.0)
+    shared = None if common is None else float(common)
+    return plain_value(FeatureKind.FLANGE, "flatness", flatness, random, shared, least=0.0)
 
 
 def _mask_inner_points(cloud: PointCloud, used: np.ndarray) -> np.ndarray:

@@ -282,9 +282,9 @@ def _whole_values(form: PipeForm, errors: PointErrors) -> tuple[FeatureValue, ..
     return tuple(values)
 
 
-def _part_of(at: list[int], *covariances: np.ndarray | None) -> list[np.ndarray | None]:
+def _part_of(at: list[int], random: np.ndarray, common: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
     """Return the covariances of some parameters."""
-    return [None if each is None else each[np.ix_(at, at)] for each in covariances]
+    return random[np.ix_(at, at)], None if common is None else common[np.ix_(at, at)]
 
 
 def _section_values(

@@ -40,8 +40,8 @@ class SurfaceSample:
         """True for samples of a mesh, which are free of noise."""
         return self.normals is not None
 
-    def select(self, chosen: np.ndarray) -> SurfaceSample:
-        """Return some of the points, by indices or a mask."""
+    def select(self, chosen: np.ndarray | slice) -> SurfaceSample:
+        """Return some of the points."""
         known, frame = self.uncertainty, self.frame
         return SurfaceSample(
             self.points_mm[chosen], None if known is None else known[chosen], None if frame is None else frame[chosen]
