@@ -24,7 +24,7 @@ from uwlts.model.parameter_keys import StageParameter
 from uwlts.model.sensor import Sensor
 from uwlts.optics.brightness import BLUR_STD, brightness_shift_std
 from uwlts.optics.line_table import LineTable, sum_terms
-from uwlts.reconstruction.moving import principal_components
+from uwlts.reconstruction.path_uncertainty import principal_components
 from uwlts.runtime.compiled import compiled
 from uwlts.storage.capture import Capture, CaptureHeader, FrameTable, sensor_poses
 from uwlts.storage.cloud import WATER, PointUncertainty

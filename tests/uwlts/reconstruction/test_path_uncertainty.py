@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from uwlts.reconstruction.moving import correct_path_uncertainty
+from uwlts.reconstruction.path_uncertainty import correct_path_uncertainty
 from uwlts.storage.cloud import PointUncertainty
 
 
