@@ -271,7 +271,7 @@ def linear_uncertainties(cloud: PointCloud, evaluation: ArtefactEvaluation) -> d
     assert cloud.uncertainty is not None
     errors = PointErrors.from_uncertainty(cloud.uncertainty, cloud.frame)
     figures, plain = linearise_figures(cloud, evaluation), evaluation.figures_mm
-    gradients = figures.gradients()
+    gradients = figures.gradients
 
     def changed(by: np.ndarray) -> np.ndarray:
         moved = figures.figures_mm(by)

@@ -36,8 +36,7 @@ from uwlts.acceptance.accept import read_acceptance
 from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.mount.calibrate_mount import calibrate_mount
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
-from uwlts.comparison.change_reference import read_datums, read_reference
-from uwlts.comparison.ideal_shapes import read_shape
+from uwlts.comparison.change_reference import read_datums, read_reference, read_shape
 from uwlts.evaluation.evaluate import read_evaluation
 from uwlts.hardware.guided.guided_plan import load_guided_plan
 from uwlts.hardware.scan_plan import load_plan

@@ -38,7 +38,7 @@ from uwlts.evaluation.artefact_figures import (
     evaluate_step,
     measure_step,
 )
-from uwlts.evaluation.figures import TOWARDS_SENSOR, Verdict, judge_interval, spread_mm
+from uwlts.evaluation.figures import TOWARDS_SENSOR, Verdict, judge_interval
 from uwlts.fitting.least_squares import VDI_OUTLIER_SHARE, FitT, principal_axes
 from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard, StepStandard
 from uwlts.model.sensor import UnitVector, Vector
@@ -154,7 +154,7 @@ def _fit_kept(
     distances = np.sort(shape.distances_mm(points))
     inside = int(np.ceil(0.95 * len(points)))
     narrowest = float(np.min(distances[inside - 1 :] - distances[: len(points) - inside + 1]))
-    return MeasuredSurface(shape, spread_mm(shape.residuals_mm), narrowest, len(points), rejected)
+    return MeasuredSurface(shape, float(np.ptp(shape.residuals_mm)), narrowest, len(points), rejected)
 
 
 Decision = Literal["nonconformity proven", "rejected", "undecided", "no MPE", "accepted", "conformity proven"]

@@ -7,7 +7,7 @@ finds the crossings, and `path_solution` the correction that they determine.
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -93,10 +93,7 @@ class AlignedTrajectory(Brief):
         return {
             "largest_shift_mm": float(shift.max()),
             "largest_turn_deg": float(np.degrees(turn.max())),
-            "crossings": [
-                {name: list(value) if isinstance(value, tuple) else value for name, value in vars(each).items()}
-                for each in self.crossings
-            ],
+            "crossings": [asdict(each) for each in self.crossings],
             "doubtful_s": [list(each) for each in self.doubtful_s],
             "margins_s": list(self.margins_s),
         }

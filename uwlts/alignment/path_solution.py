@@ -338,14 +338,13 @@ def _normal_equations(estimate: PathEstimate) -> tuple[np.ndarray, np.ndarray]:
     parts = [part for pair in estimate.pairs for part in _linearise_pair(estimate, pair)]
     if not parts:
         return np.zeros((count, count)), np.zeros((count, 1))
-    derivatives = csr_array(vstack([derivatives for derivatives, _, _ in parts]))
+    blocks, weights, distances = zip(*parts, strict=True)
+    derivatives = csr_array(vstack(blocks))
     derivatives.sum_duplicates()
     derivatives.eliminate_zeros()
-    weight = np.concatenate([weight for _, weight, _ in parts])
-    distance_mm = np.concatenate([distance_mm for _, _, distance_mm in parts])
-    weighted = derivatives.multiply(weight[:, None]).tocsr()
+    weighted = derivatives.multiply(np.concatenate(weights)[:, None]).tocsr()
     total = (derivatives.T @ weighted).toarray()
-    return total, (total @ estimate.values - weighted.T @ distance_mm)[:, None]
+    return total, (total @ estimate.values - weighted.T @ np.concatenate(distances))[:, None]
 
 
 def _linearise_pair(estimate: PathEstimate, pair: Pair) -> Iterator[tuple[csr_array, np.ndarray, np.ndarray]]:

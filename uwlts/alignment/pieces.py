@@ -103,10 +103,7 @@ class Survey:
     def from_cloud(cls, cloud: PointCloud, times_s: np.ndarray, trajectory: Trajectory) -> Survey:
         """Divide a cloud into pieces, given the times (N,) of its points on the trajectory's clock.
 
-        Raises
-        ------
-        EvaluationError
-            No piece has enough points, or images have a single one.
+        EvaluationError if no piece has enough points, or images have a single one.
         """
         moments, image = np.unique(times_s, return_inverse=True)
         order = np.argsort(image, kind="stable")

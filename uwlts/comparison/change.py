@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import asdict, dataclass, replace
+from itertools import chain
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -12,24 +13,25 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from uwlts.comparison.change_reference import (
+    IdealShape,
     Reference,
-    ReferencePoints,
     fit_local_normals,
+    place_shape,
     read_datums,
     read_reference,
     require_enough,
     require_same_unit,
+    sample_cloud,
     select_seen_side,
     stated_variance,
 )
-from uwlts.comparison.ideal_shapes import IdealShape, place_shape
-from uwlts.comparison.local_means import OPTIONS, TWO_SIDED, LocalMeans, average_locally
+from uwlts.comparison.local_means import OPTIONS, TWO_SIDED, average_locally
 from uwlts.errors import EvaluationError
 from uwlts.fitting.local_surface import choose_disc_diameter, number_cubes
 from uwlts.model.sensor import Table
 from uwlts.model.short_text import Brief
-from uwlts.registration.surface_registration import Registration, SurfaceSample, register_to_surface
-from uwlts.storage.cloud import WATER, PointCloud, PointUncertainty, rotate_covariances, rounding_std_mm
+from uwlts.registration.surface_registration import Registration, SurfaceSample, register_to_surface, select_within
+from uwlts.storage.cloud import WATER, PointCloud, PointUncertainty, rotate_covariances
 from uwlts.storage.cloud_files import load_cloud
 from uwlts.storage.pose_files import Unit
 
@@ -49,10 +51,6 @@ class ChangedRegion:
     level_mm: float
     volume_mm3: float
     extent_mm: float
-
-    def record(self) -> Table:
-        """Return the region as JSON."""
-        return {**asdict(self), "centre_mm": list(self.centre_mm)}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -163,7 +161,7 @@ class SurfaceChange(Brief):
             "apart_mm": self.apart_mm,
             "disc_mm": self.disc_mm,
             "deep_mm": self.deep_mm,
-            "regions": [region.record() for region in self.regions()],
+            "regions": [asdict(region) for region in self.regions()],
             "registration": None
             if found is None
             else {
@@ -286,33 +284,32 @@ def compare_clouds(
     for name, length in (("disc_mm", disc_mm), ("deep_mm", deep_mm)):
         if length is not None and not 0 < length < np.inf:
             raise EvaluationError(f"{name} is {length:g}; expected a positive length in mm")
+    sample = sample_cloud(new)
     disc = disc_mm or choose_disc_diameter(require_enough(new.points_mm, "cloud"), new.frame)
     surface = read_reference(reference, unit=reference_unit, disc_mm=disc)
-    exact = not isinstance(surface, ReferencePoints) or surface.meshed or surface.uncertainty is not None
+    exact = not isinstance(surface, SurfaceSample) or surface.meshed or surface.uncertainty is not None
     own, own_warnings = stated_variance(cloud_std_mm, known=new.uncertainty is not None, of="cloud")
     other, other_warnings = stated_variance(reference_std_mm, known=exact, of="reference")
     fixed = None if datums is None else read_datums(datums)
-    if isinstance(surface, ReferencePoints):
+    if isinstance(surface, SurfaceSample):
         require_same_unit(new.points_mm, require_enough(surface.points_mm, "reference"))
         if disc_mm is None and not surface.meshed:
             disc = max(disc, choose_disc_diameter(surface.points_mm, surface.frame))
         if fixed is not None and not register:
             raise EvaluationError("datums were given without a registration; set `register`")
     deep = deep_mm or OPTIONS.depth_per_disc * disc
-    if isinstance(surface, ReferencePoints):
+    if isinstance(surface, SurfaceSample):
         sides = _compare_with_points(
-            new, surface, fixed, register=register, disc=disc, deep=deep, same_water=same_water
+            sample, surface, fixed, register=register, disc=disc, deep=deep, same_water=same_water
         )
     else:
-        sides = _compare_with_shape(new, surface, fixed, register=register, disc=disc, deep=deep)
+        sides = _compare_with_shape(sample, surface, fixed, register=register, disc=disc, deep=deep)
     variance, found = sides.variance_mm2, sides.registration
     if found is not None:
         variance = variance + found.std_along(sides.places, sides.normals) ** 2
     # Rounding errors of neighbouring points are equal where a surface is parallel to an axis, and do not average out.
-    stored, read = 0.0, ()
-    if isinstance(surface, ReferencePoints):
-        stored, read = surface.rounding_std_mm, surface.warnings
-    variance = variance + rounding_std_mm(new) ** 2 + stored**2 + own + other
+    samples = [sample, surface] if isinstance(surface, SurfaceSample) else [sample]
+    variance = variance + sum(each.rounding_std_mm**2 for each in samples) + own + other
     if not np.isfinite(sides.distance_mm).any():
         raise EvaluationError(
             f"the cloud and the reference do not overlap within {deep:g} mm. Check that both have the same frame and "
@@ -330,7 +327,7 @@ def compare_clouds(
         deep,
         sides.moved,
         sides.reference,
-        tuple(dict.fromkeys([*new.warnings, *read, *own_warnings, *other_warnings])),
+        tuple(dict.fromkeys([*chain(*(each.warnings for each in samples)), *own_warnings, *other_warnings])),
         (cloud_std_mm, reference_std_mm),
     )
 
@@ -353,8 +350,8 @@ class _Distances:
 
 
 def _compare_with_points(
-    new: PointCloud,
-    surface: ReferencePoints,
+    cloud: SurfaceSample,
+    surface: SurfaceSample,
     datums: np.ndarray | None,
     *,
     register: bool,
@@ -362,101 +359,63 @@ def _compare_with_points(
     deep: float,
     same_water: bool,
 ) -> _Distances:
-    points, known, other, found = new.points_mm, new.uncertainty, surface.uncertainty, None
-    chosen, apart = _thin_points(points, disc / 2)
     depths: float | np.ndarray = deep
+    chosen, apart = _thin_points(cloud.points_mm, disc / 2)
     if surface.normals is not None:
-        surface, depths = _restrict_to_seen(points[chosen], surface, deep_mm=deep, apart_mm=apart)
-    if register:
-        target = surface.points_mm
-        found = register_to_surface(
-            SurfaceSample(points, known, new.frame),
-            SurfaceSample(target, other, surface.frame),
-            reach_mm=deep,
-            datums=datums,
+        seen, depths = select_seen_side(
+            cloud.points_mm[chosen], surface.points_mm, surface.normals, deep_mm=deep, apart_mm=apart
         )
-        points, known = _move_points(points, known, found)
-        if other is not None:
+        surface = replace(surface, points_mm=surface.points_mm[seen], normals=surface.normals[seen])
+    found = register_to_surface(cloud, surface, reach_mm=deep, datums=datums) if register else None
+    if found is not None:
+        cloud = _move_cloud(cloud, found)
+        if surface.uncertainty is not None:
             # The registration follows systematic errors of the reference.
-            followed = [found.moves_mm(step, target) for step in found.by_reference]
-            other = replace(other, patterns_mm=other.patterns_mm - np.array(followed, np.float32))
-    places = points[chosen]
+            followed = found.follow(surface.uncertainty, -found.by_reference, surface.points_mm)
+            surface = replace(surface, uncertainty=followed)
+    places = cloud.points_mm[chosen]
     normals = fit_local_normals(places, surface.points_mm, disc_mm=disc, given=surface.normals)
-    here = average_locally(places, normals, points, uncertainty=known, frame=new.frame, disc_mm=disc, deep_mm=depths)
-    there = average_locally(
-        places, normals, surface.points_mm, uncertainty=other, frame=surface.frame, disc_mm=disc, deep_mm=depths
-    )
+    here, there = (average_locally(places, normals, each, disc_mm=disc, deep_mm=depths) for each in (cloud, surface))
     # The samples of a mesh are exact, so their scatter is no noise.
     variance = here.variance_mm2 + (0.0 if surface.meshed else there.variance_mm2)
     variance += np.sum(here.patterns_mm**2, axis=1) + np.sum(there.patterns_mm**2, axis=1)
+    known, other = cloud.uncertainty, surface.uncertainty
     if known is not None and other is not None:
-        variance -= 2 * _shared_covariance(here.patterns_mm, known, there.patterns_mm, other, same_water=same_water)
+        for name in known.shared.keys() & other.shared.keys():
+            if same_water or not name.startswith(WATER):
+                ours, theirs = here.patterns_mm @ known.shared[name], there.patterns_mm @ other.shared[name]
+                variance -= 2 * np.sum(ours * theirs, axis=1)
     words = "mesh" if surface.meshed else "cloud"
     return _Distances(places, apart, normals, here.mean_mm - there.mean_mm, variance, found, found, words)
 
 
-def _restrict_to_seen(
-    places: np.ndarray, surface: ReferencePoints, *, deep_mm: float, apart_mm: float
-) -> tuple[ReferencePoints, np.ndarray]:
-    assert surface.normals is not None
-    seen, deep = select_seen_side(places, surface.points_mm, surface.normals, deep_mm=deep_mm, apart_mm=apart_mm)
-    return replace(surface, points_mm=surface.points_mm[seen], normals=surface.normals[seen]), deep
-
-
 def _compare_with_shape(
-    new: PointCloud, shape: IdealShape, datums: np.ndarray | None, *, register: bool, disc: float, deep: float
+    cloud: SurfaceSample, shape: IdealShape, datums: np.ndarray | None, *, register: bool, disc: float, deep: float
 ) -> _Distances:
-    points, known, chosen = new.points_mm, new.uncertainty, slice(None)
-    if datums is not None:
-        if not (register or shape.fitted):
-            raise EvaluationError(
-                "datums were given without a registration, and this shape has a given position; set `register`"
-            )
-        away = np.linalg.norm(points[:, None] - datums[:, :3], axis=2)
-        if shape.fitted:
-            chosen = np.flatnonzero(np.any(away <= datums[:, 3], axis=1))
-    placed = place_shape(
-        shape, points[chosen], uncertainty=None if known is None else known[chosen], frame=new.frame[chosen]
-    )
-    found, moved = placed.registration, None
-    if found is not None and known is not None:
-        normals = placed.nearest(points).normals
-        followed = [found.moves_mm(step, points, normals) for step in found.by_cloud]
-        known = replace(known, patterns_mm=known.patterns_mm + np.array(followed, np.float32))
-    elif found is None and register:
-        near = placed.nearest(points, reach_mm=deep)
-        below = points - near.distance_mm[:, None] * near.normals
-        target = SurfaceSample(below[np.isfinite(near.distance_mm)])
-        found = moved = register_to_surface(
-            SurfaceSample(points, known, new.frame), target, reach_mm=deep, datums=datums
+    fitted = shape.point_mm is None
+    if datums is not None and not (register or fitted):
+        raise EvaluationError(
+            "datums were given without a registration, and this shape has a given position; set `register`"
         )
-        points, known = _move_points(points, known, found)
-    spread, apart = _thin_points(points, disc / 2)
-    places = points[spread]
-    here: LocalMeans = average_locally(
-        places,
-        normals := placed.nearest(places).normals,
-        points,
-        distance_mm=placed.nearest(points, reach_mm=deep).distance_mm,
-        uncertainty=known,
-        frame=new.frame,
-        disc_mm=disc,
-        deep_mm=deep,
-    )
+    chosen = slice(None) if datums is None or not fitted else select_within(cloud.points_mm, datums)
+    placed = place_shape(shape, cloud.select(chosen))
+    found, moved = placed.registration, None
+    if found is not None and cloud.uncertainty is not None:
+        normals = placed.nearest(cloud.points_mm)[1]
+        cloud = replace(cloud, uncertainty=found.follow(cloud.uncertainty, found.by_cloud, cloud.points_mm, normals))
+    elif found is None and register:
+        distance, normals = placed.nearest(cloud.points_mm, reach_mm=deep)
+        below = cloud.points_mm - distance[:, None] * normals
+        target = SurfaceSample(below[np.isfinite(distance)])
+        found = moved = register_to_surface(cloud, target, reach_mm=deep, datums=datums)
+        cloud = _move_cloud(cloud, found)
+    spread, apart = _thin_points(cloud.points_mm, disc / 2)
+    places = cloud.points_mm[spread]
+    normals, distance = placed.nearest(places)[1], placed.nearest(cloud.points_mm, reach_mm=deep)[0]
+    here = average_locally(places, normals, cloud, distance_mm=distance, disc_mm=disc, deep_mm=deep)
     variance = here.variance_mm2 + np.sum(here.patterns_mm**2, axis=1)
     reference = placed.describe() + placed.note_misfit(places, here.mean_mm, variance)
     return _Distances(places, apart, normals, here.mean_mm, variance, found, moved, reference)
-
-
-def _shared_covariance(
-    here: np.ndarray, known: PointUncertainty, there: np.ndarray, other: PointUncertainty, *, same_water: bool
-) -> np.ndarray:
-    """Return the covariance (P,) of the local means of two clouds by shared errors, from the shifts (P, M) of each."""
-    result = np.zeros(len(here))
-    for name in known.shared.keys() & other.shared.keys():
-        if same_water or not name.startswith(WATER):
-            result += np.sum((here @ known.shared[name]) * (there @ other.shared[name]), axis=1)
-    return result
 
 
 def _estimate_areas(places: np.ndarray) -> np.ndarray:
@@ -482,18 +441,13 @@ def _thin_points(points: np.ndarray, apart: float) -> tuple[np.ndarray, float]:
         apart *= max(np.sqrt(len(first) / OPTIONS.most_places), 1.02)
 
 
-def _move_points(
-    points: np.ndarray, known: PointUncertainty | None, found: Registration
-) -> tuple[np.ndarray, PointUncertainty | None]:
-    """Move points by a registration; its response to systematic errors is added to their patterns."""
-    rotation = found.transform[:3, :3]
-    points = points @ rotation.T + found.transform[:3, 3]
+def _move_cloud(cloud: SurfaceSample, found: Registration) -> SurfaceSample:
+    """Move a cloud by a registration; its response to systematic errors is added to their patterns."""
+    rotation, known = found.transform[:3, :3], cloud.uncertainty
+    points = cloud.points_mm @ rotation.T + found.transform[:3, 3]
     if known is None:
-        return points, None
-    patterns = known.patterns_mm @ rotation.T
-    followed = [found.moves_mm(step, points) for step in found.by_cloud]
-    patterns = patterns + np.array(followed, np.float32).reshape(patterns.shape)
+        return replace(cloud, points_mm=points)
     poses = None if known.poses_mm is None else known.poses_mm @ rotation.T
-    position = known.position_mm @ rotation.T
-    random = rotate_covariances(known.random_mm2, rotation)
-    return points, PointUncertainty(random, position, patterns.astype(np.float32), poses, known.shared)
+    turned = rotate_covariances(known.random_mm2, rotation), known.position_mm @ rotation.T
+    known = PointUncertainty(*turned, known.patterns_mm @ rotation.T, poses, known.shared)
+    return replace(cloud, points_mm=points, uncertainty=found.follow(known, found.by_cloud, points))

@@ -1,28 +1,192 @@
-"""References of a comparison (earlier cloud, mesh or ideal shape), the sides of a mesh that a scan saw, and datums."""
+"""References of a comparison: earlier cloud, mesh with the sides that a scan saw, or ideal shape; and datums."""
 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self, assert_never
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.spatial import KDTree
 
-from uwlts.comparison.ideal_shapes import KINDS, IdealShape, read_shape
 from uwlts.comparison.local_means import OPTIONS
 from uwlts.errors import DescriptionError, EvaluationError, describe_problems
 from uwlts.evaluation.figures import TOWARDS_SENSOR
-from uwlts.files.reading import MOST_TOML_BYTES, parse_toml, read_text
+from uwlts.files.reading import read_toml
+from uwlts.fitting.least_squares import fit_robustly, thin_evenly
 from uwlts.fitting.local_surface import POINTS_PER_DISC
 from uwlts.model.sensor import Description, Positive, Vector
-from uwlts.storage.cloud import PointCloud, PointUncertainty, rounding_std_mm
+from uwlts.registration.surface_registration import Registration, SurfaceSample, shape_registration
+from uwlts.shapes.cylinder import Cylinder
+from uwlts.shapes.flat import Plane
+from uwlts.shapes.sphere import Sphere
+from uwlts.storage.cloud import PointCloud, rounding_std_mm
 from uwlts.storage.cloud_files import is_readable_cloud, load_cloud
 from uwlts.storage.mesh_file import has_faces, load_triangles
 from uwlts.storage.number_tables import MM_PER_UNIT, Unit
+
+_MOST_FITTED = 50_000  # number of points above which a cloud is thinned for a fit; more take longer without a benefit
+_MISFIT_STD = 5.0  # distance of a place from a fitted shape, in standard deviations, beyond which it departs from it
+_MISFIT_SIZE = 0.002
+"""Least such distance, divided by the radius, or by half the extent of a plane: out of roundness of usual parts."""
+_MISFIT_SHARE = 0.4
+"""Share of departing places from which a surface is no such shape: local changes cover less of it. Judged on the tubes
+and bells of tests/uwlts/comparison/test_ideal_misfit.py."""
+
+
+class _Shape(Description):
+    """Ideal shape, fitted to the cloud unless it has a position; ``way`` is the name of its field of a direction."""
+
+    way: ClassVar[str] = ""
+
+    kind: Any  # the literal of each shape
+    point_mm: Vector | None = None
+
+    @property
+    def radius_mm(self) -> float | None:
+        """Known radius; 0 for a plane."""
+        size = getattr(self, "diameter_mm", 0.0)
+        return None if size is None else size / 2
+
+    @model_validator(mode="after")
+    def _placed_or_not(self) -> Self:
+        given = getattr(self, self.way, None)
+        if self.way and (self.point_mm is None) != (given is None):
+            raise ValueError(f"give both point_mm and {self.way} of the {self.kind}, or neither to fit it")
+        if self.point_mm is not None and self.radius_mm is None:
+            raise ValueError(f"a {self.kind} with a given {self.way or 'centre'} also needs diameter_mm")
+        if given is not None and not any(given):
+            raise ValueError(f"the {self.way} is (0, 0, 0); expected a direction")
+        return self
+
+
+class IdealPlane(_Shape):
+    """Plane through a point; distances are positive on the side of the normal."""
+
+    way = "normal"
+
+    kind: Literal["plane"] = "plane"
+    normal: Vector | None = None
+
+
+class IdealSphere(_Shape):
+    """Sphere; fitted with a free or known diameter unless its centre ``point_mm`` is given."""
+
+    kind: Literal["sphere"] = "sphere"
+    diameter_mm: Positive | None = None
+
+
+class IdealCylinder(_Shape):
+    """Cylinder; fitted with a free or known diameter unless ``point_mm`` on its axis and ``axis`` are given."""
+
+    way = "axis"
+
+    kind: Literal["cylinder"] = "cylinder"
+    diameter_mm: Positive | None = None
+    axis: Vector | None = None
+
+
+IdealShape = IdealPlane | IdealSphere | IdealCylinder
+
+KINDS: dict[str, IdealShape] = {"plane": IdealPlane(), "sphere": IdealSphere(), "cylinder": IdealCylinder()}
+"""Shapes of free size and position, by name."""
+
+
+def read_shape(path: Path) -> IdealShape:
+    """Read an ideal shape from a TOML file; CaptureError or DescriptionError if this fails."""
+    return _read_description(path, Annotated[IdealShape, Field(discriminator="kind")], called="ideal shape")
+
+
+def _read_description(path: Path, kind: Any, *, called: str) -> Any:
+    table = read_toml(path, called=called)
+    try:
+        return TypeAdapter(kind).validate_python(table)
+    except ValidationError as error:
+        raise DescriptionError(f"{path} contains no valid {called}: {describe_problems(error)}") from error
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedShape:
+    """Shape at a position."""
+
+    kind: str
+    point_mm: np.ndarray  # (3,); point of the plane, centre of the sphere, or point on the axis
+    direction: np.ndarray | None  # (3,) or None; unit normal or axis; None for a sphere
+    radius_mm: float  # radius; 0 for a plane
+    registration: Registration | None = None  # uncertainty of a fitted shape; None for a given one
+
+    def nearest(self, points_mm: np.ndarray, *, reach_mm: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
+        """Return signed distances (N,) and normals (N, 3) of points (N, 3), outwards or along a plane's normal.
+
+        Distances beyond ``reach_mm`` are NaN.
+        """
+        away, direction = points_mm - self.point_mm, self.direction
+        if self.kind == "plane" and direction is not None:
+            normals, distance = np.broadcast_to(direction, away.shape), away @ direction
+        else:
+            if direction is not None:
+                away = away - np.outer(away @ direction, direction)
+            length = np.linalg.norm(away, axis=1)
+            normals, distance = away / np.maximum(length, 1e-300)[:, None], length - self.radius_mm
+        return np.where(np.abs(distance) <= reach_mm, distance, np.nan), normals
+
+    def note_misfit(self, places_mm: np.ndarray, distance_mm: np.ndarray, variance_mm2: np.ndarray) -> str:
+        """Return a note if most of a surface departs from this fitted shape; empty otherwise.
+
+        ``distance_mm`` (P,) are local means at places (P, 3), NaN if farther away than searched, with their variance.
+        A local change covers the smaller part of a surface, so that it does not count.
+        """
+        size = self.radius_mm or 0.5 * float(np.linalg.norm(np.ptp(places_mm, axis=0)))
+        limit = np.maximum(_MISFIT_STD * np.sqrt(variance_mm2), _MISFIT_SIZE * size)
+        share = float(np.mean(~(np.abs(distance_mm) <= limit)))
+        if self.registration is None or share < _MISFIT_SHARE:
+            return ""
+        return (
+            f"; {100 * share:.0f} % of the surface departs by more than {float(np.nanmedian(limit)):.2g} mm: it is no "
+            f"{self.kind}, and distances are no local changes"
+        )
+
+    def describe(self) -> str:
+        """Describe kind, size and position as text."""
+        size = f" of {2 * self.radius_mm:.4f} mm diameter" if self.radius_mm else ""
+        place = ", ".join(f"{value:.3f}" for value in self.point_mm)
+        way = "" if self.direction is None else f", direction ({', '.join(f'{v:.5f}' for v in self.direction)})"
+        return f"{self.kind}{size} at ({place}) mm{way}{'' if self.registration is None else ', fitted'}"
+
+
+def place_shape(shape: IdealShape, cloud: SurfaceSample) -> PlacedShape:
+    """Return a given shape, or fit it robustly to the points of a cloud.
+
+    EvaluationError if the points do not determine the shape.
+    """
+    radius = shape.radius_mm
+    if shape.point_mm is not None:
+        way = getattr(shape, shape.way, None)
+        direction = None if way is None else np.array(way, float) / np.linalg.norm(way)
+        return PlacedShape(shape.kind, np.array(shape.point_mm, float), direction, radius or 0.0)
+    chosen = thin_evenly(np.arange(len(cloud.points_mm)), _MOST_FITTED)
+    points = cloud.points_mm[chosen]
+    match shape:
+        case IdealPlane():
+            robust = fit_robustly(Plane.fit, points, towards=TOWARDS_SENSOR)
+            placed = PlacedShape(shape.kind, robust.fit.point_mm, robust.fit.normal, 0.0)
+        case IdealSphere():
+            robust = fit_robustly(Sphere.fit, points, radius_mm=radius)
+            placed = PlacedShape(shape.kind, robust.fit.centre_mm, None, robust.fit.radius_mm)
+        case IdealCylinder():
+            start = Cylinder.fit(thin_evenly(points, 2000), radius_mm=radius).axis
+            robust = fit_robustly(Cylinder.fit, points, radius_mm=radius, axis_start=start)
+            placed = PlacedShape(shape.kind, robust.fit.point_mm, robust.fit.axis, robust.fit.radius_mm)
+        case _:
+            assert_never(shape)
+    used = cloud.select(chosen[robust.inliers])
+    registration = shape_registration(used, *placed.nearest(used.points_mm), sized=radius is None)
+    return replace(placed, registration=registration)
+
 
 _OPPOSITE = -0.5
 """Largest cosine between the normals of opposite sides: 120 deg, beyond the angle of two faces at an edge."""
@@ -119,31 +283,11 @@ def _orient_places(places: np.ndarray, normals: np.ndarray, apart_mm: float) -> 
     return sign, part
 
 
-# --- sides of a mesh --------------------------------------------------------------------------------------------------
-
-
 _SAMPLES_PER_DISC = 60  # samples of a mesh in a disc: twice the points of a cloud, so that the cloud's noise dominates
 _MOST_SAMPLES = 3_000_000  # limit of memory for samples of a mesh
 _AT_A_TIME = 20_000  # places, to limit memory
 
 Reference = PointCloud | IdealShape | str | os.PathLike[str]
-
-
-@dataclass(frozen=True, eq=False)
-class ReferencePoints:
-    """Points (M, 3) of a cloud with their uncertainty, or samples of a mesh with its normals (M, 3)."""
-
-    points_mm: np.ndarray
-    normals: np.ndarray | None = None
-    uncertainty: PointUncertainty | None = None
-    frame: np.ndarray | None = None
-    rounding_std_mm: float = 0.0
-    warnings: tuple[str, ...] = ()
-
-    @property
-    def meshed(self) -> bool:
-        """True for samples of a mesh, which are free of noise."""
-        return self.normals is not None
 
 
 class Datum(Description):
@@ -164,26 +308,15 @@ def read_datums(datums: np.ndarray | str | os.PathLike[str]) -> np.ndarray:
     another shape, is not finite, or has a radius that is not positive.
     """
     if isinstance(datums, str | os.PathLike):
-        text = read_text(Path(datums), most_bytes=MOST_TOML_BYTES, called="datums", foreign="is not valid TOML")
-        try:
-            known = _Datums.model_validate(parse_toml(text)).datum
-        except ValidationError as error:
-            raise DescriptionError(f"{datums} contains no valid datums: {describe_problems(error)}") from error
-        except ValueError as error:
-            raise DescriptionError(f"{datums} is not valid TOML: {error}") from error
+        known = _read_description(Path(datums), _Datums, called="datums").datum
         datums = np.array([(*each.centre_mm, each.radius_mm) for each in known]).reshape(-1, 4)
     given = np.asarray(datums, float)
-    if (
-        given.ndim != 2
-        or given.shape[1] != 4
-        or not len(given)
-        or not (np.isfinite(given).all() and (given[:, 3] > 0).all())
-    ):
+    if given.shape[1:] != (4,) or not len(given) or not (np.isfinite(given).all() and (given[:, 3] > 0).all()):
         raise EvaluationError(f"datums are rows of x, y, z and a positive radius in mm; found the shape {given.shape}")
     return given
 
 
-def read_reference(reference: Reference, *, unit: Unit | None, disc_mm: float) -> ReferencePoints | IdealShape:
+def read_reference(reference: Reference, *, unit: Unit | None, disc_mm: float) -> SurfaceSample | IdealShape:
     """Read a reference as points in mm, or as an ideal shape from its name (plane, sphere, cylinder) or TOML file."""
     scale = MM_PER_UNIT[unit or "mm"]
     if isinstance(reference, str) and reference in KINDS:
@@ -193,7 +326,7 @@ def read_reference(reference: Reference, *, unit: Unit | None, disc_mm: float) -
         if path.suffix.lower() == ".toml":
             reference = read_shape(path)
         elif path.suffix.lower() == ".h5" or (is_readable_cloud(path) and not has_faces(path)):
-            return _points_of(load_cloud(path, unit=unit), 1.0)
+            return sample_cloud(load_cloud(path, unit=unit))
         else:
             mesh = load_triangles(path, unit=unit)
             return sample_mesh(np.asarray(mesh.vertices, float), np.asarray(mesh.faces), disc_mm=disc_mm)
@@ -201,12 +334,12 @@ def read_reference(reference: Reference, *, unit: Unit | None, disc_mm: float) -
         return reference
     if scale != 1.0 and reference.uncertainty is not None:
         raise EvaluationError("the unit is m, but clouds with uncertainty are always in mm; omit the unit")
-    return _points_of(load_cloud(reference), scale)
+    return sample_cloud(load_cloud(reference), scale)
 
 
-def _points_of(cloud: PointCloud, scale: float) -> ReferencePoints:
+def sample_cloud(cloud: PointCloud, scale: float = 1.0) -> SurfaceSample:
     points, rounding = scale * cloud.points_mm, scale * rounding_std_mm(cloud)
-    return ReferencePoints(points, None, cloud.uncertainty, cloud.frame, rounding, tuple(cloud.warnings))
+    return SurfaceSample(points, cloud.uncertainty, cloud.frame, None, rounding, tuple(cloud.warnings))
 
 
 def stated_variance(std_mm: float | None, *, known: bool, of: str) -> tuple[float, list[str]]:
@@ -230,7 +363,7 @@ def stated_variance(std_mm: float | None, *, known: bool, of: str) -> tuple[floa
     return std_mm**2, []
 
 
-def sample_mesh(vertices: np.ndarray, faces: np.ndarray, *, disc_mm: float) -> ReferencePoints:
+def sample_mesh(vertices: np.ndarray, faces: np.ndarray, *, disc_mm: float) -> SurfaceSample:
     """Sample points evenly over a mesh, with the normals of their triangles, which agree across edges."""
     corners = vertices[orient_triangles(vertices, faces)]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -248,7 +381,7 @@ def sample_mesh(vertices: np.ndarray, faces: np.ndarray, *, disc_mm: float) -> R
     u[inside], v[inside] = 1 - u[inside], 1 - v[inside]
     first, second, third = corners[chosen].transpose(1, 0, 2)
     points = first + u[:, None] * (second - first) + v[:, None] * (third - first)
-    return ReferencePoints(points, across[chosen] / (2 * area[chosen, None] + 1e-300))
+    return SurfaceSample(points, normals=across[chosen] / (2 * area[chosen, None] + 1e-300))
 
 
 def require_enough(points: np.ndarray, name: str) -> np.ndarray:

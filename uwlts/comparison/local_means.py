@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.stats import t as t_distribution
 
+from uwlts.registration.surface_registration import SurfaceSample
 from uwlts.storage.cloud import PointUncertainty, project_variance
 
 
@@ -59,11 +60,9 @@ class LocalMeans(NamedTuple):
 def average_locally(
     places: np.ndarray,
     normals: np.ndarray,
-    points: np.ndarray,
+    surface: SurfaceSample,
     *,
     distance_mm: np.ndarray | None = None,
-    uncertainty: PointUncertainty | None,
-    frame: np.ndarray | None,
     disc_mm: float,
     deep_mm: float | np.ndarray,
 ) -> LocalMeans:
@@ -72,10 +71,11 @@ def average_locally(
     The variance is the larger of the propagated variance (noise of points, position of images) and the empirical
     scatter. The scatter is corrected for correlation within an image, and by Student's t for the number of points.
 
-    ``places`` and ``normals`` (P, 3) are the centres of the discs and unit normals there, ``points`` (N, 3) those to
-    average. ``distance_mm`` (N,) is by default measured from each place along its normal. Points farther than
-    ``deep_mm`` (one number, or one for each place) along the normal are left out.
+    ``places`` and ``normals`` (P, 3) are the centres of the discs and unit normals there. ``distance_mm`` (N,) is by
+    default measured from each place along its normal. Points farther than ``deep_mm`` (one number, or one for each
+    place) along the normal are left out.
     """
+    points, uncertainty, frame = surface.points_mm, surface.uncertainty, surface.frame
     count, mean, rough, stated, other = (np.zeros(len(places)) for _ in range(5))
     together, alone = np.zeros(len(places)), np.zeros(len(places))
     patterns = np.zeros((len(places), 0 if uncertainty is None else len(uncertainty.patterns_mm)))

@@ -4,12 +4,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise, permutations
-from typing import Any, ClassVar, assert_never
+from typing import Any, assert_never
 
 import numpy as np
 
 from uwlts.errors import EvaluationError
-from uwlts.evaluation.figures import TOWARDS_SENSOR, ArtefactEvaluation, FigureId, Quantity, spread_mm
+from uwlts.evaluation.figures import TOWARDS_SENSOR, ArtefactEvaluation
 from uwlts.fitting.least_squares import RobustFit, fit_robustly
 from uwlts.model.artefacts import Artefact, PipeStandard, PlaneStandard, SphereStandard, StepStandard
 from uwlts.shapes.cylinder import Cylinder
@@ -56,11 +56,10 @@ class SpacingResult:
 class SphereEvaluation(ArtefactEvaluation):
     """Evaluation of spheres in the order of the artefact's description, and of their consecutive spacings."""
 
-    kind: ClassVar[str] = "spheres"
-
     artefact: SphereStandard
     spheres: tuple[SphereResult, ...]
     spacings: tuple[SpacingResult, ...]
+    labels: np.ndarray  # (N,) int; number, from 0, of the sphere of each used point; -1 for others
 
     @property
     def pe_mm(self) -> float:
@@ -72,22 +71,10 @@ class SphereEvaluation(ArtefactEvaluation):
         """Largest standard deviation of the radial residuals of a sphere."""
         return max(sphere.std_mm for sphere in self.spheres)
 
-    @property
-    def sse_mm(self) -> float | None:
-        """Signed sphere spacing error of the largest absolute value; None for a single sphere."""
-        return max((spacing.sse_mm for spacing in self.spacings), key=abs, default=None)
-
-    def values_mm(self) -> dict[FigureId, float | None]:
-        kind = Quantity
-        values: dict[FigureId, float | None] = {(kind.PROBING_ERROR, ()): self.pe_mm, (kind.STD, ()): self.std_mm}
-        for number, sphere in enumerate(self.spheres, start=1):
-            values[kind.PROBING_ERROR, (number,)] = sphere.pe_mm
-            values[kind.STD, (number,)] = sphere.std_mm
-            values[kind.DIAMETER_ERROR, (number,)] = sphere.diameter_error_mm
-        for number, spacing in enumerate(self.spacings, start=1):
-            values[kind.SPACING_ERROR, (number, number + 1)] = spacing.sse_mm
-            values[kind.SPACING_ERROR_KNOWN_RADIUS, (number, number + 1)] = spacing.sse_known_radius_mm
-        return values
+    def part_of(self, spheres: tuple[int, ...]) -> object:
+        if not spheres:
+            return self
+        return (self.spheres if len(spheres) == 1 else self.spacings)[spheres[0] - 1]
 
 
 def evaluate_spheres(points: np.ndarray, artefact: SphereStandard) -> SphereEvaluation:
@@ -96,7 +83,7 @@ def evaluate_spheres(points: np.ndarray, artefact: SphereStandard) -> SphereEval
     EvaluationError for missing spheres, or for hollow spheres, which indicate rotated images.
     """
     found = _sort_spheres(_find_spheres(points, artefact, np.random.default_rng(0)), artefact)
-    deviation = np.full(len(points), np.nan)
+    deviation, labels = np.full(len(points), np.nan), np.full(len(points), -1)
     spheres, fits = [], []
     for sphere, diameter in zip(found, artefact.diameters_mm, strict=True):
         members, robust = _fit_cap(points, sphere, artefact.cap_angle_deg)
@@ -106,7 +93,7 @@ def evaluate_spheres(points: np.ndarray, artefact: SphereStandard) -> SphereEval
                 "the spheres are hollow: their points are behind their centres, where the sensor cannot see them. The "
                 "images may be rotated by 180 deg or mirrored relative to those of the calibration"
             )
-        deviation[used] = fit.residuals_mm
+        deviation[used], labels[used] = fit.residuals_mm, len(fits)
         fits.append((fit, Sphere.fit(points[used], diameter / 2)))
         spheres.append(
             SphereResult(
@@ -114,7 +101,7 @@ def evaluate_spheres(points: np.ndarray, artefact: SphereStandard) -> SphereEval
                 diameter_mm=2 * fit.radius_mm,
                 diameter_error_mm=2 * fit.radius_mm - diameter,
                 diameter_std_mm=2 * float(np.sqrt(fit.covariance[3, 3])),
-                pe_mm=spread_mm(fit.residuals_mm),
+                pe_mm=float(np.ptp(fit.residuals_mm)),
                 std_mm=fit.std_mm,
                 points_used=len(used),
                 points_rejected=robust.rejected,
@@ -137,6 +124,7 @@ def evaluate_spheres(points: np.ndarray, artefact: SphereStandard) -> SphereEval
         deviation_mm=deviation,
         spheres=tuple(spheres),
         spacings=tuple(spacings),
+        labels=labels,
         points_excluded=sum(len(sphere.members) for sphere in found) - sum(counts),
     )
 
@@ -225,15 +213,10 @@ class PlaneEvaluation(ArtefactEvaluation):
     `normal` points to the sensor; deviations are positive on that side.
     """
 
-    kind: ClassVar[str] = "plane"
-
     re_mm: float
     std_mm: float
     point_mm: tuple[float, float, float]
     normal: tuple[float, float, float]
-
-    def values_mm(self) -> dict[FigureId, float | None]:
-        return {(Quantity.RANGE_ERROR, ()): self.re_mm, (Quantity.STD, ()): self.std_mm}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -244,8 +227,6 @@ class PipeEvaluation(ArtefactEvaluation):
     less than half of the circumference is visible, since a shift of the axis then resembles ovality.
     """
 
-    kind: ClassVar[str] = "pipe"
-
     diameter_mm: float
     diameter_error_mm: float
     diameter_std_mm: float
@@ -254,14 +235,6 @@ class PipeEvaluation(ArtefactEvaluation):
     ovality_mm: float | None
     point_mm: tuple[float, float, float]
     axis: tuple[float, float, float]
-
-    def values_mm(self) -> dict[FigureId, float | None]:
-        return {
-            (Quantity.DIAMETER_ERROR, ()): self.diameter_error_mm,
-            (Quantity.RANGE, ()): self.range_mm,
-            (Quantity.STD, ()): self.std_mm,
-            (Quantity.OVALITY, ()): self.ovality_mm,
-        }
 
 
 def evaluate_plane(points: np.ndarray, artefact: PlaneStandard) -> PlaneEvaluation:
@@ -273,7 +246,7 @@ def evaluate_plane(points: np.ndarray, artefact: PlaneStandard) -> PlaneEvaluati
     return PlaneEvaluation(
         artefact=artefact,
         **counts,
-        re_mm=spread_mm(robust.fit.residuals_mm),
+        re_mm=float(np.ptp(robust.fit.residuals_mm)),
         std_mm=robust.fit.std_mm,
         point_mm=tuple(robust.fit.point_mm.tolist()),
         normal=tuple(robust.fit.normal.tolist()),
@@ -300,7 +273,7 @@ def evaluate_pipe(points: np.ndarray, artefact: PipeStandard) -> PipeEvaluation:
         diameter_mm=2 * fit.radius_mm,
         diameter_error_mm=error,
         diameter_std_mm=2 * float(np.sqrt(fit.covariance[4, 4])),
-        range_mm=spread_mm(fit.residuals_mm),
+        range_mm=float(np.ptp(fit.residuals_mm)),
         std_mm=fit.std_mm,
         ovality_mm=measure_ovality(points[robust.inliers], fit),
         point_mm=tuple(fit.point_mm.tolist()),
@@ -339,8 +312,6 @@ def measure_ovality(points: np.ndarray, fit: Cylinder) -> float | None:
 class StepEvaluation(ArtefactEvaluation):
     """Evaluation of a step, mm. Deviations refer to the reference face's plane, shifted by the calibrated height."""
 
-    kind: ClassVar[str] = "step"
-
     # Mean distance of the points of one face from the plane of the other; standard uncertainty by their scatter alone.
     height_mm: float
     height_error_mm: float
@@ -360,12 +331,10 @@ class StepEvaluation(ArtefactEvaluation):
     point_mm: tuple[float, float, float]
     labels: np.ndarray  # (N,) int8; face of each point (`StepFace`)
 
-    def values_mm(self) -> dict[FigureId, float | None]:
-        return {
-            (Quantity.HEIGHT_ERROR, ()): self.height_error_mm,
-            (Quantity.STD, ()): max(self.lower_std_mm, self.upper_std_mm),
-            (Quantity.PROFILE_HEIGHT_ERROR, ()): self.profile_height_error_mm,
-        }
+    @property
+    def std_mm(self) -> float:
+        """Larger one of both standard deviations."""
+        return max(self.lower_std_mm, self.upper_std_mm)
 
 
 def evaluate_step(points: np.ndarray, frame: np.ndarray, artefact: StepStandard) -> StepEvaluation:

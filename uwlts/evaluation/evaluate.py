@@ -68,12 +68,6 @@ class ArtefactFigures(StoredResult):
             "surfaces, or check whether all images are of one scan"
         ]
 
-    @model_serializer(mode="wrap")
-    def _verdict_last(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        content = plain(self)
-        content["within_vdi_outliers"] = content.pop("within_vdi_outliers")
-        return content
-
 
 class Evaluation(Brief, StoredResult):
     """Result of `evaluate`, and content of its file.
@@ -172,46 +166,19 @@ class Evaluation(Brief, StoredResult):
         write_model(path, self, file_format=FORMAT, version=VERSION, overwrite=overwrite)
 
 
-def compare_cloud_with_truth(cloud: PointCloud, truth: Truth) -> TruthComparison:
-    """Compare a cloud with the true surface; EvaluationError if truth and cloud do not match."""
-    images = cloud.metadata.get("images")
-    if images is not None and images != len(truth.status):
-        raise EvaluationError(
-            f"the cloud is of a capture of {images} images, the truth of one of {len(truth.status)}: give the truth "
-            "of the cloud's capture"
-        )
-    return compare_with_truth(
-        cloud.points_mm,
-        cloud.frame,
-        cloud.line,
-        point_mm=truth.point_mm,
-        normal=truth.normal,
-        status=truth.status,
-        tolerance_mm=TOLERANCE_MM,
-    )
-
-
 def _compare_with_truth(cloud: PointCloud, truth: Truth) -> TruthComparison:
     """Compare a cloud with its ground truth, as it is and after the best-fit motion.
 
     A calibrated sensor's frame has its own origin and axes. After the best-fit motion, errors of form and size remain.
     """
-    compared = compare_cloud_with_truth(cloud, truth)
+    compared = compare_with_truth(cloud, truth, tolerance_mm=TOLERANCE_MM)
     measured, errors = cloud.points_mm[compared.is_matched], compared.error_mm[compared.is_matched]
     motion = fit_rigid_transform(measured, measured - errors)
     moved = cloud.points_mm @ motion[:3, :3].T + motion[:3, 3]
     stated = None if cloud.uncertainty is None else tuple((2 * shift_std_mm(cloud, compared.is_matched)).tolist())
-    fitted = compare_cloud_with_truth(replace(cloud, points_mm=moved), truth)
+    fitted = compare_with_truth(replace(cloud, points_mm=moved), truth, tolerance_mm=TOLERANCE_MM)
     shift = tuple(np.mean(errors, axis=0).tolist())
     return compared.model_copy(update={"after_best_fit": fitted, "shift_mm": shift, "shift_expanded_mm": stated})
-
-
-def _read_matching_truth(path: str | Path, cloud: PointCloud) -> Truth:
-    """Read a truth file; EvaluationError if it is that of another scene than the cloud's."""
-    header, truth = read_truth(path)
-    if other := _name_other_scene(header, Path(path), cloud.metadata):
-        raise EvaluationError(f"{path} is the truth of another capture: {other}; give the truth of the cloud's capture")
-    return truth
 
 
 def _name_other_scene(header: TruthHeader, path: Path, metadata: Table) -> str | None:
@@ -283,7 +250,12 @@ def evaluate(
     elif isinstance(artefact, dict):
         artefact = parse_artefact(artefact)
     if truth is not None and not isinstance(truth, Truth):
-        truth = _read_matching_truth(truth, cloud)
+        header, read = read_truth(truth)
+        if other := _name_other_scene(header, Path(truth), cloud.metadata):
+            raise EvaluationError(
+                f"{truth} is the truth of another capture: {other}; give the truth of the cloud's capture"
+            )
+        truth = read
     if artefact is None and truth is None:
         raise EvaluationError(
             "there is no reference for the evaluation: the capture names no artefact. Give `artefact` or `truth`"

@@ -1,6 +1,7 @@
 """Uncertainty of an artefact's figures and of a cloud's position, including correlations between points."""
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from uwlts.evaluation.artefact_figures import (
     measure_ovality,
     measure_step,
 )
-from uwlts.evaluation.figures import ArtefactEvaluation, FigureUncertainty, Quantity, spread_mm
+from uwlts.evaluation.figures import ArtefactEvaluation, FigureUncertainty, Quantity
 from uwlts.fitting.propagation import LinearisedFit, PointErrors, noise_shifts
 from uwlts.model.artefacts import StepStandard
 from uwlts.shapes.cylinder import Cylinder
@@ -36,36 +37,50 @@ def figure_uncertainties(cloud: PointCloud, evaluation: ArtefactEvaluation) -> d
     """
     if (uncertainty := cloud.uncertainty) is None:
         return {}
-    plain, figures = evaluation.figures_mm, linearise_figures(cloud, evaluation)
-
-    def changed(by: np.ndarray) -> np.ndarray:
-        moved = figures.figures_mm(by)
-        return np.array([moved[name] - value for name, value in plain.items()])
-
+    figures = linearise_figures(cloud, evaluation)
     errors = PointErrors.from_uncertainty(uncertainty, cloud.frame)
     draws = int(np.clip(_DRAWN_POINTS // len(cloud.points_mm), _FEWEST_DRAWS, _MOST_DRAWS))
-    by_noise, by_calibration = errors.propagate(changed, draws=draws)
-    assert by_calibration is not None
-    stated = {name: (float(r), float(s)) for name, r, s in zip(plain, by_noise, by_calibration, strict=True)}
-    linear = {name: errors.linear_std(by_points) for name, by_points in figures.gradients().items()}
-    return {name: FigureUncertainty(linear.get(name, random), system) for name, (random, system) in stated.items()}
+    stated = propagate_figures(errors, evaluation.figures_mm, figures.figures_mm, draws=draws)
+    linear = {name: errors.linear_std(by_points) for name, by_points in figures.gradients.items()}
+    return stated | {name: replace(stated[name], random_mm=std) for name, std in linear.items()}
 
 
-def linearise_figures(
-    cloud: PointCloud, evaluation: ArtefactEvaluation
-) -> "LinearisedSpheres | _LinearisedPlane | _LinearisedPipe | _LinearisedStep":
+def propagate_figures(
+    errors: PointErrors, figures_mm: dict[str, float], after: Callable[[np.ndarray], dict[str, float]], *, draws: int
+) -> dict[str, FigureUncertainty]:
+    """Return the uncertainties of figures; ``after`` returns the figures after shifts (N, 3) of the points."""
+
+    def changed(moves: np.ndarray) -> list[float]:
+        moved = after(moves)
+        return [moved[name] - value for name, value in figures_mm.items()]
+
+    random, systematic = errors.propagate(changed, draws=draws)
+    assert systematic is not None
+    found = zip(figures_mm, random, systematic, strict=True)
+    return {name: FigureUncertainty(float(by_noise), float(common)) for name, by_noise, common in found}
+
+
+@dataclass(frozen=True, eq=False)
+class LinearisedFigures:
+    """Figures of an evaluation as functions of small shifts of the cloud's points, with a fixed choice of points."""
+
+    figures_mm: Callable[[np.ndarray], dict[str, float]]  # figures by name after shifts (N, 3)
+    gradients: dict[str, np.ndarray]  # derivatives (N, 3) of the figures that are linear in the points
+
+
+def linearise_figures(cloud: PointCloud, evaluation: ArtefactEvaluation) -> LinearisedFigures:
     """Return the figures of an evaluation as functions of small shifts of the cloud's points."""
     match evaluation:
         case SphereEvaluation():
-            return LinearisedSpheres(cloud.points_mm, evaluation)
+            return _linearise_spheres(cloud.points_mm, evaluation)
         case PlaneEvaluation():
-            return _LinearisedPlane(cloud.points_mm, evaluation)
+            return _linearise_plane(cloud.points_mm, evaluation)
         case PipeEvaluation():
-            return _LinearisedPipe(cloud.points_mm, evaluation)
+            return _linearise_pipe(cloud.points_mm, evaluation)
         case StepEvaluation():
-            return _LinearisedStep(cloud, evaluation)
+            return _linearise_step(cloud, evaluation)
         case _:
-            raise TypeError(f"no figures of {evaluation.kind} are known")
+            raise TypeError(f"no figures of {evaluation.artefact.kind} are known")
 
 
 def shift_std_mm(cloud: PointCloud, used: np.ndarray) -> np.ndarray:
@@ -87,135 +102,98 @@ def shift_std_mm(cloud: PointCloud, used: np.ndarray) -> np.ndarray:
     return np.sqrt(np.sum(moved**2, axis=0)) / count
 
 
-class _LinearisedPlane:
-    """Linearised plane of an evaluation of points (N, 3), mm, with fixed outliers."""
+def _linearise_plane(points: np.ndarray, evaluation: PlaneEvaluation) -> LinearisedFigures:
+    used = np.flatnonzero(np.isfinite(evaluation.deviation_mm))
+    fit = LinearisedFit(Plane.fit(points[used], towards=np.array(evaluation.normal)), points, used)
 
-    def __init__(self, points: np.ndarray, evaluation: PlaneEvaluation):
-        used = np.flatnonzero(np.isfinite(evaluation.deviation_mm))
-        self._evaluation = evaluation
-        self._fit = LinearisedFit(Plane.fit(points[used], towards=np.array(evaluation.normal)), points, used)
+    def figures_mm(moves: np.ndarray) -> dict[str, float]:
+        residuals = fit.shift(moves)[1]
+        return replace(evaluation, re_mm=float(np.ptp(residuals)), std_mm=fit.std_mm(residuals)).figures_mm
 
-    def figures_mm(self, moves: np.ndarray) -> dict[str, float]:
-        """Return the evaluation's figures after shifts (N, 3) of all points."""
-        _, residuals = self._fit.shift(moves)
-        std_mm = self._fit.std_mm(residuals)
-        return replace(self._evaluation, re_mm=spread_mm(residuals), std_mm=std_mm).figures_mm
-
-    def gradients(self) -> dict[str, np.ndarray]:
-        """Return the derivatives (N, 3) of figures that are linear in the points; here none."""
-        return {}
+    return LinearisedFigures(figures_mm, {})
 
 
-class _LinearisedPipe:
-    """Linearised cylinder of an evaluation of points (N, 3), mm, with fixed outliers."""
+def _linearise_pipe(points: np.ndarray, evaluation: PipeEvaluation) -> LinearisedFigures:
+    used = np.flatnonzero(np.isfinite(evaluation.deviation_mm))
+    pipe = Cylinder.fit(points[used], axis_start=evaluation.axis)
+    fit = LinearisedFit(pipe, points, used)
 
-    def __init__(self, points: np.ndarray, evaluation: PipeEvaluation):
-        used = np.flatnonzero(np.isfinite(evaluation.deviation_mm))
-        self._points, self._evaluation, self._count = points[used], evaluation, len(points)
-        self._pipe = Cylinder.fit(points[used], axis_start=evaluation.axis)
-        self._fit = LinearisedFit(self._pipe, points, used)
-
-    def figures_mm(self, moves: np.ndarray) -> dict[str, float]:
-        """Return the evaluation's figures after shifts (N, 3) of all points."""
-        step, residuals = self._fit.shift(moves)
+    def figures_mm(moves: np.ndarray) -> dict[str, float]:
+        step, residuals = fit.shift(moves)
         return replace(
-            self._evaluation,
-            diameter_error_mm=self._evaluation.diameter_error_mm + 2 * float(step[4]),
-            range_mm=spread_mm(residuals),
-            std_mm=self._fit.std_mm(residuals),
-            ovality_mm=measure_ovality(self._points, replace(self._pipe, residuals_mm=residuals)),
+            evaluation,
+            diameter_error_mm=evaluation.diameter_error_mm + 2 * float(step[4]),
+            range_mm=float(np.ptp(residuals)),
+            std_mm=fit.std_mm(residuals),
+            ovality_mm=measure_ovality(points[used], replace(pipe, residuals_mm=residuals)),
         ).figures_mm
 
-    def gradients(self) -> dict[str, np.ndarray]:
-        """Return the derivatives (N, 3) of figures that are linear in the points."""
-        (name,) = (f.key.name for f in self._evaluation.figures if f.key.quantity is Quantity.DIAMETER_ERROR)
-        return {name: self._fit.gradient(np.array([0.0, 0.0, 0.0, 0.0, 2.0]), self._count)}
+    by_radius = fit.gradient(np.array([0.0, 0.0, 0.0, 0.0, 2.0]), len(points))
+    return LinearisedFigures(figures_mm, {str(Quantity.DIAMETER_ERROR): by_radius})
 
 
-class _LinearisedStep:
-    """Figures of a step in a cloud, with fixed faces."""
+def _linearise_step(cloud: PointCloud, evaluation: StepEvaluation) -> LinearisedFigures:
+    artefact, labels, points = evaluation.artefact, evaluation.labels, cloud.points_mm
+    assert isinstance(artefact, StepStandard)
 
-    def __init__(self, cloud: PointCloud, evaluation: StepEvaluation):
-        assert isinstance(evaluation.artefact, StepStandard)
-        self._cloud, self._evaluation, self._labels = cloud, evaluation, evaluation.labels
-        self._artefact = evaluation.artefact
+    def figures_mm(moves: np.ndarray) -> dict[str, float]:
+        return measure_step(points + moves, cloud.frame, labels, artefact).figures_mm
 
-    def figures_mm(self, moves: np.ndarray) -> dict[str, float]:
-        """Return the evaluation's figures after shifts (N, 3) of all points."""
-        points = self._cloud.points_mm + moves
-        return measure_step(points, self._cloud.frame, self._labels, self._artefact).figures_mm
-
-    def gradients(self) -> dict[str, np.ndarray]:
-        """Return the derivatives (N, 3) of the height: mean distance of a face from the plane of the other."""
-        points, base = self._cloud.points_mm, StepFace[self._artefact.reference.upper()]
-        used, across = (np.flatnonzero(self._labels == face) for face in (base, base.other))
-        plane = Plane.fit(points[used])
-        fit = LinearisedFit(plane, points, used)
-        result = fit.gradient(plane.derivatives(points[across]).mean(axis=0), len(points))
-        result[across] = plane.normal / len(across)
-        (name,) = (f.key.name for f in self._evaluation.figures if f.key.quantity is Quantity.HEIGHT_ERROR)
-        return {name: np.sign(plane.distances_mm(points[across]).mean()) * result}
+    # The height is the mean distance of a face from the plane of the other.
+    base = StepFace[artefact.reference.upper()]
+    used, across = (np.flatnonzero(labels == face) for face in (base, base.other))
+    plane = Plane.fit(points[used])
+    result = LinearisedFit(plane, points, used).gradient(plane.derivatives(points[across]).mean(axis=0), len(points))
+    result[across] = plane.normal / len(across)
+    by_points = np.sign(plane.distances_mm(points[across]).mean()) * result
+    return LinearisedFigures(figures_mm, {str(Quantity.HEIGHT_ERROR): by_points})
 
 
-class LinearisedSpheres:
-    """Linearised spheres of an evaluation of points (N, 3), mm, with a fixed assignment of points."""
-
-    def __init__(self, points: np.ndarray, evaluation: SphereEvaluation):
-        self._evaluation, self._count = evaluation, len(points)
-        diameters = evaluation.artefact.diameters_mm
-        used = np.flatnonzero(np.isfinite(evaluation.deviation_mm))
-        centres = np.array([sphere.centre_mm for sphere in evaluation.spheres])
-        radii = np.array([sphere.diameter_mm for sphere in evaluation.spheres]) / 2
-        off = np.abs(np.linalg.norm(points[used, None] - centres, axis=2) - radii)
-        members = [used[np.argmin(off, axis=1) == number] for number in range(len(radii))]
-        self._free = [LinearisedFit(Sphere.fit(points[own]), points, own) for own in members]
-        self._known = [
-            LinearisedFit(Sphere.fit(points[own], d / 2), points, own)
-            for own, d in zip(members, diameters, strict=True)
+def _linearise_spheres(points: np.ndarray, evaluation: SphereEvaluation) -> LinearisedFigures:
+    artefact = evaluation.artefact
+    members = [np.flatnonzero(evaluation.labels == number) for number in range(len(evaluation.spheres))]
+    free, known = (
+        [
+            LinearisedFit(Sphere.fit(points[own], radius), points, own)
+            for own, radius in zip(members, radii_mm, strict=True)
         ]
+        for radii_mm in ([None] * len(members), [diameter / 2 for diameter in artefact.diameters_mm])
+    )
 
-    def figures_mm(self, moves: np.ndarray) -> dict[str, float]:
-        """Return the evaluation's figures after shifts (N, 3) of all points."""
-        free = [fit.shift(moves) for fit in self._free]
-        moved = [fit.shape.centre_mm + step[:3] for fit, (step, _) in zip(self._free, free, strict=True)]
-        known = [fit.shape.centre_mm + fit.shift(moves)[0] for fit in self._known]
-        spheres = [
+    def figures_mm(moves: np.ndarray) -> dict[str, float]:
+        spheres, errors = [], []
+        for fits in (free, known):
+            moved = [fit.shift(moves) for fit in fits]
+            middles = [fit.shape.centre_mm + step[:3] for fit, (step, _) in zip(fits, moved, strict=True)]
+            errors.append(np.linalg.norm(np.diff(middles, axis=0), axis=1) - artefact.spacings_mm)
+            spheres.append(moved)
+        measured = tuple(
             replace(
                 sphere,
-                diameter_mm=sphere.diameter_mm + 2 * step[3],
                 diameter_error_mm=sphere.diameter_error_mm + 2 * step[3],
-                pe_mm=spread_mm(residuals),
+                pe_mm=float(np.ptp(residuals)),
                 std_mm=fit.std_mm(residuals),
             )
-            for sphere, fit, (step, residuals) in zip(self._evaluation.spheres, self._free, free, strict=True)
-        ]
-        spacings = []
-        for number, spacing in enumerate(self._evaluation.spacings):
-            calibrated = spacing.spacing_mm - spacing.sse_mm
-            apart = float(np.linalg.norm(moved[number + 1] - moved[number]))
-            apart_known = float(np.linalg.norm(known[number + 1] - known[number]))
-            errors = {"sse_mm": apart - calibrated, "sse_known_radius_mm": apart_known - calibrated}
-            spacings.append(replace(spacing, spacing_mm=apart, **errors))
-        return replace(self._evaluation, spheres=tuple(spheres), spacings=tuple(spacings)).figures_mm
+            for sphere, fit, (step, residuals) in zip(evaluation.spheres, free, spheres[0], strict=True)
+        )
+        spacings = tuple(
+            replace(spacing, sse_mm=by_free, sse_known_radius_mm=by_known)
+            for spacing, by_free, by_known in zip(evaluation.spacings, *errors, strict=True)
+        )
+        return replace(evaluation, spheres=measured, spacings=spacings).figures_mm
 
-    def gradients(self) -> dict[str, np.ndarray]:
-        """Return the derivatives (N, 3) of figures that are linear in the points."""
-        found: dict[str, np.ndarray] = {}
-        for key in (figure.key for figure in self._evaluation.figures):
-            match key.quantity:
-                case Quantity.DIAMETER_ERROR:
-                    by_radius = np.array([0.0, 0.0, 0.0, 2.0])
-                    found[key.name] = self._free[key.spheres[0] - 1].gradient(by_radius, self._count)
-                case Quantity.SPACING_ERROR:
-                    found[key.name] = self._spacing_gradient(key.spheres, self._free)
-                case Quantity.SPACING_ERROR_KNOWN_RADIUS:
-                    found[key.name] = self._spacing_gradient(key.spheres, self._known)
-                case _:
-                    pass  # ranges and standard deviations are not linear in the points
-        return found
-
-    def _spacing_gradient(self, spheres: tuple[int, ...], fits: list[LinearisedFit[Sphere]]) -> np.ndarray:
-        first, second = fits[spheres[0] - 1 if spheres else 0 :][:2]
-        between = second.shape.centre_mm - first.shape.centre_mm
-        along = np.append(between / np.linalg.norm(between), 0.0)[: len(first.shape.covariance)]
-        return second.gradient(along, self._count) - first.gradient(along, self._count)
+    gradients: dict[str, np.ndarray] = {}
+    for key in (figure.key for figure in evaluation.figures):
+        match key.quantity:
+            case Quantity.DIAMETER_ERROR:
+                by_radius = np.array([0.0, 0.0, 0.0, 2.0])
+                gradients[key.name] = free[key.spheres[0] - 1].gradient(by_radius, len(points))
+            case Quantity.SPACING_ERROR | Quantity.SPACING_ERROR_KNOWN_RADIUS:
+                fits = free if key.quantity is Quantity.SPACING_ERROR else known
+                first, second = (fits[number - 1] for number in key.spheres)
+                between = second.shape.centre_mm - first.shape.centre_mm
+                along = np.append(between / np.linalg.norm(between), 0.0)[: len(first.shape.covariance)]
+                gradients[key.name] = second.gradient(along, len(points)) - first.gradient(along, len(points))
+            case _:
+                pass  # ranges and standard deviations are not linear in the points
+    return LinearisedFigures(figures_mm, gradients)

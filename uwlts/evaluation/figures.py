@@ -2,19 +2,20 @@
 
 import dataclasses
 import math
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Annotated, Any, ClassVar, Literal, assert_never, get_args
+from typing import Annotated, Any, Literal, assert_never, get_args
 
 import numpy as np
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic_core import to_jsonable_python
 
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import VDI_OUTLIER_SHARE
 from uwlts.model.artefacts import Artefact, PipeStandard, PlaneStandard, SphereStandard, StepStandard
-from uwlts.storage.truth import TruthStatus
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.truth import Truth, TruthStatus
 
 TOWARDS_SENSOR = np.array([0.0, 0.0, -1.0])
 """Direction from a surface to the sensor in the object coordinate system."""
@@ -35,8 +36,19 @@ class Quantity(StrEnum):
     PROFILE_HEIGHT_ERROR = "profile height error"
 
 
-FigureId = tuple[Quantity, tuple[int, ...]]
-"""Quantity and the numbers (from 1) of its spheres; no numbers for a figure of the whole artefact."""
+_FIELDS = {
+    Quantity.PROBING_ERROR: "pe_mm",
+    Quantity.RANGE_ERROR: "re_mm",
+    Quantity.RANGE: "range_mm",
+    Quantity.STD: "std_mm",
+    Quantity.OVALITY: "ovality_mm",
+    Quantity.DIAMETER_ERROR: "diameter_error_mm",
+    Quantity.SPACING_ERROR: "sse_mm",
+    Quantity.SPACING_ERROR_KNOWN_RADIUS: "sse_known_radius_mm",
+    Quantity.HEIGHT_ERROR: "height_error_mm",
+    Quantity.PROFILE_HEIGHT_ERROR: "profile_height_error_mm",
+}
+"""Fields of an evaluation, a sphere or a spacing."""
 
 
 @dataclass(frozen=True)
@@ -154,15 +166,13 @@ def _sphere_keys(artefact: SphereStandard) -> tuple[FigureKey, ...]:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ArtefactEvaluation(ABC):
+class ArtefactEvaluation:
     """Figures of an artefact and the numbers of its points.
 
     ``points_rejected`` counts the outliers on the artefact (`fit_robustly`). Points that do not belong to the artefact
     are the rest of the cloud. ``deviation_mm`` (N,) is the signed deviation of each used point of the
     cloud, NaN for all others.
     """
-
-    kind: ClassVar[str]
 
     artefact: Artefact
     points_used: int
@@ -189,17 +199,17 @@ class ArtefactEvaluation(ABC):
     def vdi_range_mm(self) -> float:
         """Range of the deviations without the 0.3 % of the points with the largest ones, as VDI/VDE 2634 allows."""
         used = self.deviation_mm[np.isfinite(self.deviation_mm)]
-        return spread_mm(used[np.argsort(np.abs(used))[: len(used) - int(VDI_OUTLIER_SHARE * len(used))]])
+        return float(np.ptp(used[np.argsort(np.abs(used))[: len(used) - int(VDI_OUTLIER_SHARE * len(used))]]))
 
-    @abstractmethod
-    def values_mm(self) -> dict[FigureId, float | None]:
-        """Return the values of the figures, mm; None or no entry for a figure that could not be measured."""
+    def part_of(self, spheres: tuple[int, ...]) -> object:
+        """Return the result that has the figures of one sphere or of two; the evaluation itself without any."""
+        return self
 
     @property
     def figures(self) -> tuple[Figure, ...]:
-        """Measured figures of the artefact."""
-        values = self.values_mm()
-        found = ((key, values.get((key.quantity, key.spheres))) for key in figure_keys(self.artefact))
+        """Figures of the artefact that could be measured."""
+        keys = figure_keys(self.artefact)
+        found = ((key, getattr(self.part_of(key.spheres), _FIELDS[key.quantity])) for key in keys)
         return tuple(Figure(key, value) for key, value in found if value is not None)
 
     @property
@@ -213,27 +223,14 @@ class ArtefactEvaluation(ABC):
             field.name for field in dataclasses.fields(self) if field.name not in ("artefact", "deviation_mm", "labels")
         ]
         return {
-            "kind": self.kind,
+            "kind": self.artefact.kind,
             "figures_mm": self.figures_mm,
             "points_total": self.points_total,
-            **{name: _plain(getattr(self, name)) for name in own},
+            **{name: to_jsonable_python(getattr(self, name)) for name in own},
             "rejected_share": self.rejected_share,
             "vdi_range_mm": self.vdi_range_mm,
             "within_vdi_outliers": self.within_vdi_outliers,
         }
-
-
-def spread_mm(residuals_mm: np.ndarray) -> float:
-    """Return the range of residuals, largest minus smallest (PE and RE of VDI/VDE 2634)."""
-    return float(np.ptp(residuals_mm))
-
-
-def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    if isinstance(value, tuple):
-        return [_plain(item) for item in value]
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
 Verdict = Literal["exceeds the limit", "undecided", "within the limit", "no limit"]
@@ -303,36 +300,24 @@ class TruthComparison(StoredResult):
         return {key: value for key, value in plain(self).items() if value is not None}
 
 
-def compare_with_truth(
-    points: np.ndarray,
-    frame: np.ndarray,
-    line: np.ndarray,
-    *,
-    point_mm: np.ndarray,
-    normal: np.ndarray,
-    status: np.ndarray,
-    tolerance_mm: float = 0.01,
-) -> TruthComparison:
+def compare_with_truth(cloud: PointCloud, truth: Truth, *, tolerance_mm: float) -> TruthComparison:
     """Compare points with the true surface by their signed distances (p - p_true) . n.
 
-    ``points`` (N, 3) in mm come with their image and row or column (N,). ``point_mm`` and ``normal`` (F, L, 3) are the
-    true point and unit normal of each line of each frame, in the frame of the points. They count where ``status`` (F,
-    L) is 0, a visible stripe.
+    The true point and unit normal of a point's frame and line count where the true stripe is visible.
 
-    Raises EvaluationError if points have no frame and line or ones outside the truth, visible truth is not finite or
-    has no unit normals, or no point matches.
+    Raises EvaluationError if the cloud is of another capture, or points have no frame and line within the truth. The
+    same if visible truth is not finite or has no unit normals, or if no point matches.
     """
-    points, point_mm, normal = (np.asarray(values, dtype=np.float64) for values in (points, point_mm, normal))
-    frame, line = np.asarray(frame), np.asarray(line)
-    visible = np.asarray(status) == TruthStatus.VISIBLE
-    if points.shape != (len(points), 3) or frame.shape != (len(points),) or line.shape != frame.shape:
-        raise ValueError(f"expected (N, 3) points and (N,) indices; found {points.shape}, {frame.shape}, {line.shape}")
-    shapes = point_mm.shape, normal.shape, visible.shape
-    if visible.ndim != 2 or shapes[:2] != ((*visible.shape, 3),) * 2:
-        raise ValueError(f"expected truth of the shapes (F, L, 3), (F, L, 3), (F, L); found {shapes}")
+    images = cloud.metadata.get("images")
+    if images is not None and images != len(truth.status):
+        raise EvaluationError(
+            f"the cloud is of a capture of {images} images, the truth of one of {len(truth.status)}: give the truth "
+            "of the cloud's capture"
+        )
+    points, frame, line = cloud.points_mm, cloud.frame, cloud.line
+    point_mm, normal = (np.asarray(values, dtype=np.float64) for values in (truth.point_mm, truth.normal))
+    visible = truth.status == TruthStatus.VISIBLE
     outside = (frame < 0) | (frame >= visible.shape[0]) | (line < 0) | (line >= visible.shape[1])
-    if not np.isfinite(points).all():
-        raise EvaluationError("some points are not finite; remove them")
     if outside.any():
         first = int(np.argmax(outside))
         raise EvaluationError(
@@ -361,7 +346,7 @@ def compare_with_truth(
         is_matched=matched,
         error_mm=error,
         distance_mm=distance,
-        tolerance_mm=float(tolerance_mm),
+        tolerance_mm=tolerance_mm,
         mean_mm=float(signed.mean()),
         std_mm=float(signed.std()),
         rms_mm=float(np.sqrt(np.mean(signed**2))),

@@ -20,7 +20,7 @@ from tokenize import TokenError
 from typing import TYPE_CHECKING, Any, TypeVar
 from zipfile import BadZipFile
 
-from uwlts.errors import CaptureError, Error, make_printable
+from uwlts.errors import CaptureError, DescriptionError, Error, make_printable
 
 if TYPE_CHECKING:
     from pydantic import JsonValue
@@ -166,6 +166,15 @@ def parse_json(text: str) -> "JsonValue":
     except RecursionError as error:
         raise json.JSONDecodeError(_TOO_DEEP, text, 0) from error
     return require_plain(content)
+
+
+def read_toml(path: str | Path, *, called: str, error: type[Error] = CaptureError) -> "dict[str, JsonValue]":
+    """Read a TOML file; raises ``error`` if it cannot be read, and DescriptionError if it is not valid TOML."""
+    text = read_text(path, most_bytes=MOST_TOML_BYTES, error=error, called=called, foreign="is not valid TOML")
+    try:
+        return parse_toml(text)
+    except ValueError as problem:
+        raise DescriptionError(f"{path} is not valid TOML: {problem}") from problem
 
 
 def parse_toml(text: str) -> "dict[str, JsonValue]":

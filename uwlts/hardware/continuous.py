@@ -315,8 +315,7 @@ class _FrameReader:
                 warn("the latency of the stage is unknown and taken as 0: both_ways = true measures it")
             else:
                 try:
-                    found = measure_latency(centres, stage, speed)
-                    latency_s, std_s = found.latency_s, found.std_s
+                    latency_s, std_s = measure_latency(centres, stage, speed)
                 except EvaluationError as error:
                     warn(f"the latency of the stage is taken as 0: {error}")
         stage = stage + speed * latency_s

@@ -84,11 +84,15 @@ def profile_rows(
         nothing = own[:1] if len(own) else order[:1]
         first, last = np.searchsorted(place, grid - bandwidth), np.searchsorted(place, grid + bandwidth)
         for middle, a, b in zip(grid, first, last, strict=True):
-            u = (place[a:b] - middle) / bandwidth
-            row = _quadratic_row(u)
-            columns.append(own[a:b] if row is not None else nothing)
-            values.append(row if row is not None else np.array([np.nan]))
-            lengths.append(lengths[-1] + len(values[-1]))
+            u, row, near = (place[a:b] - middle) / bandwidth, np.array([np.nan]), nothing
+            if len(u) >= 5 and u[0] <= -0.2 and u[-1] >= 0.2:
+                design = np.stack([np.ones(len(u)), u, u * u], axis=1)
+                loaded = (design * np.maximum(1 - u * u, 0)[:, None]).T
+                if np.linalg.cond(normal := loaded @ design) <= 1e6:
+                    row, near = np.linalg.solve(normal, np.eye(3)[0]) @ loaded, own[a:b]
+            columns.append(near)
+            values.append(row)
+            lengths.append(lengths[-1] + len(row))
     parts = np.concatenate(values), np.concatenate(columns), np.array(lengths)
     return sparse.csr_array(parts, shape=(count * len(grid), len(across)))
 
@@ -110,18 +114,6 @@ def cubic_weights(cells: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarra
     away = np.abs(cells[:, None] - at)
     weight = np.where(away <= 1, (1.5 * away - 2.5) * away**2 + 1, ((-0.5 * away + 2.5) * away - 4) * away + 2)
     return np.clip(at, 0, length - 1), np.where((at >= 0) & (at < length), weight, 0.0)
-
-
-def _quadratic_row(u: np.ndarray) -> np.ndarray | None:
-    """Return the weights of values at places u of the value at 0 of a local quadratic; None if undetermined."""
-    if len(u) < 5 or u.min() > -0.2 or u.max() < 0.2:
-        return None
-    weight = np.maximum(1 - u * u, 0)
-    design = np.stack([np.ones(len(u)), u, u * u], axis=1)
-    normal = (design * weight[:, None]).T @ design
-    if np.linalg.cond(normal) > 1e6:
-        return None
-    return np.linalg.solve(normal, np.eye(3)[0]) @ (design * weight[:, None]).T
 
 
 _DRAWS = 2000  # noise draws: fifty exceed the 97.5 % quantile, which is then known to a tenth of a standard deviation

@@ -135,14 +135,9 @@ def limit_deviations(
     Outliers of one direction within ``together_mm`` of each other, more than chance explains with the given probability
     of a false alarm, show a small blemish: they are no outliers, and keep their heights.
 
-    Returns
-    -------
-    surface : UnrolledSurface
-        Surface with limited deviations.
-    outliers : (N,) bool
-        Points far from their neighbours, relative to the neighbours' scatter.
-    ratio : float
-        Standard deviation of the other points from the medians, divided by that of the limited deviations.
+    Returns the surface with limited deviations; a mask (N,) of outliers, far from their neighbours relative to these
+    neighbours' scatter; and the standard deviation of the other points from the medians, divided by that of the limited
+    deviations.
     """
     nearest = np.empty((len(surface.places), SEARCH_RULE.neighbours), np.int32)
     middle, spread = np.empty(len(nearest)), np.empty(len(nearest))
@@ -312,16 +307,12 @@ def _standardise(values: np.ndarray, block: int) -> tuple[np.ndarray, np.ndarray
     spread = np.maximum(spread, 1e-12)
     t = (values - middle) / spread
     # A scatter from few places is uncertain: map Student's t to the normal variable of equal probability.
-    log_tail = np.minimum(_log_tail_of_t(np.abs(t), freedom), np.log(0.5))
-    return spread, np.sign(t) * _normal_of_log_tail(log_tail)
+    return spread, np.sign(t) * _normal_of_t(np.abs(t), freedom)
 
 
-def _log_tail_of_t(t: np.ndarray, freedom: np.ndarray) -> np.ndarray:
-    return np.log(np.maximum(special.stdtr(freedom, -t), 1e-300))
-
-
-def _normal_of_log_tail(log_tail: np.ndarray) -> np.ndarray:
-    return -special.ndtri(np.exp(log_tail))
+def _normal_of_t(t: np.ndarray | float, freedom: np.ndarray | float) -> np.ndarray:
+    """Return the standard normal variable of the same tail probability as Student's ``t``, which is not negative."""
+    return -special.ndtri(np.clip(special.stdtr(freedom, -np.asarray(t)), 1e-300, 0.5))
 
 
 def _spectral_moment(z: np.ndarray, axis: int, cell: float) -> float:
@@ -361,7 +352,7 @@ class Tail:
 
     def normalise(self, strength: float) -> float:
         """Return the standard normal variable of equal probability for a height in robust standard deviations."""
-        return float(_normal_of_log_tail(_log_tail_of_t(np.array(strength / self._scale), np.array(self.freedom))))
+        return float(_normal_of_t(strength / self._scale, self.freedom))
 
     def scatter_at(self, z: float) -> float:
         """Return the height, in robust standard deviations, for a standard normal variable."""

@@ -40,7 +40,6 @@ from uwlts.inspection.features import SEED
 class Indication:
     """Significant departure of a surface from its shape."""
 
-    place: np.ndarray  # (2,); middle, mm
     radius_mm: float  # radius of the bell
     height_mm: float  # signed height
     z: float  # height in standard deviations
@@ -69,7 +68,6 @@ class BlemishSearch:
     outliers: np.ndarray  # (N,) bool
     undamaged: np.ndarray  # (N,) bool; points that are neither outliers nor in an indication
     level_mm: np.ndarray  # (N,); least significant height of an indication of the smallest size
-    noise_mm: np.ndarray  # (N,); effective noise of each point
     smallest_mm: float  # smallest radius of the search
     gap_mm: float  # distance from all points, from which a place is not seen
     threshold: float  # least significant z
@@ -132,29 +130,28 @@ def search_blemishes(surface: UnrolledSurface, *, false_alarm: float, largest_mm
                 level = np.sign(peak.height) * float(np.median(surface.heights[points]))
                 bound = max(0.0, level - SEARCH_RULE.edge_std * float(maps[0].noise_at(peak.place[None])[0]))
                 outcome = UnresolvedDeparture(int(tree.query(peak.place)[1]), peak.height, bound, str(error))
-            found.append(_Candidate(peak, outcome, points[undamaged[points]]))
+            found.append(_Candidate(peak, outcome, points))
             undamaged[points] = False
-    level, noise = np.full(len(places), np.nan), np.full(len(places), np.nan)
+    level = np.full(len(places), np.nan)
     if maps:
         tail, found = _confirm(surface, undamaged, maps[0], threshold, found)
         level = tail.scatter_at(threshold) * maps[0].level_at(places)
-        noise = maps[0].noise_at(places)
     small = _assign_outliers(seen, outliers, found, together, false_alarm)
     kept: list[Indication] = []
-    for peak, outcome, _ in found:
-        if isinstance(outcome, Indication):
+    for peak, outcome, points in found:
+        if isinstance(outcome, float):
             chance = min(1.0, sum(each.false_alarms(peak.z) for each in maps))
-            kept.append(replace(outcome, z=peak.z, false_alarm=chance, noise_mm=wider * outcome.noise_mm))
+            kept.append(Indication(peak.radius, peak.height, peak.z, chance, wider * outcome, points))
     departures = [each.outcome for each in found if isinstance(each.outcome, UnresolvedDeparture)]
-    known = tuple(kept), (*departures, *small), outliers, undamaged, level, wider * noise
+    known = tuple(kept), (*departures, *small), outliers, undamaged, level
     return BlemishSearch(*known, smallest, gap, threshold, false_alarm)
 
 
 class _Candidate(NamedTuple):
-    """Significant peak, what is at its place, and the points (K,) removed with it."""
+    """Significant peak, and the points (K,) removed with it."""
 
     peak: _Peak
-    outcome: Indication | UnresolvedDeparture | None  # None for the rest of another indication
+    outcome: float | UnresolvedDeparture | None  # noise of an indication, mm; None for the rest of another one
     points: np.ndarray
 
 
@@ -196,10 +193,9 @@ def _assign_outliers(
         near, share = away[is_near], np.count_nonzero(~is_near) / (len(outliers) - len(points))
         left[near] = False
         is_rare = stats.binom.sf(len(near) - 1, len(points) + len(near), share) * len(found) < false_alarm
-        if is_rare and isinstance(outcome, Indication):
+        if is_rare and isinstance(outcome, float):
             outliers[near] = False
-            points = np.concatenate([points, near])
-            found[number] = _Candidate(peak, replace(outcome, points=points), points)
+            found[number] = _Candidate(peak, outcome, np.concatenate([points, near]))
     departures = []
     for sign in (-1, 1):
         together = find_together(surface.places, left & (sign * heights > 0), radius, false_alarm)
@@ -209,16 +205,12 @@ def _assign_outliers(
         shape = len(together), len(together)
         joined = sparse.coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=shape)
         count, group = csgraph.connected_components(joined, directed=False)
-        departures += [_name_group(together[group == k], heights) for k in range(count)]
+        for points in (together[group == k] for k in range(count)):
+            # A group is bounded by the least of its points.
+            away, top = np.abs(heights[points]), int(points[np.argmax(np.abs(heights[points]))])
+            reason = f"{len(points)} points show it; {SEARCH_RULE.points_in_smallest} are needed"
+            departures.append(UnresolvedDeparture(top, float(heights[top]), float(away.min()), reason))
     return departures
-
-
-def _name_group(points: np.ndarray, heights: np.ndarray) -> UnresolvedDeparture:
-    """Return a group of outliers (K,) of one direction as a departure, bounded by the least of them."""
-    away = np.abs(heights[points])
-    reason = f"{len(points)} points show it; {SEARCH_RULE.points_in_smallest} are needed"
-    top = int(points[np.argmax(away)])
-    return UnresolvedDeparture(top, float(heights[top]), float(away.min()), reason)
 
 
 def _solve_threshold(maps: Sequence[BellMap], false_alarm: float) -> float:
@@ -282,11 +274,11 @@ def _delimit(
     maps: Sequence[BellMap],
     peak: _Peak,
     smallest: float,
-) -> tuple[Indication | None, np.ndarray]:
-    """Return a peak with its region, and the points of this: adjacent cells that depart in the same direction.
+) -> tuple[float | None, np.ndarray]:
+    """Return the noise at a peak, and the points of its region: adjacent cells that depart in the same direction.
 
-    Without an indication, the region is the rest of another one. EvaluationError if the region or its surroundings
-    have too few points.
+    Without a noise, the region is the rest of another one. EvaluationError if the region or its surroundings have too
+    few points.
     """
     noise, reach, step = float(maps[0].noise_at(peak.place[None])[0]), 3.0 * peak.radius, max(smallest, peak.radius / 4)
     first: tuple[np.ndarray, _Region] | None = None
@@ -307,8 +299,7 @@ def _delimit(
         return None, points
     if len(points) < SEARCH_RULE.fewest_points:
         raise EvaluationError(f"it has {len(points)} points; {SEARCH_RULE.fewest_points} are needed")
-    chance = min(1.0, sum(each.false_alarms(peak.z) for each in maps))
-    return Indication(peak.place, peak.radius, peak.height, peak.z, chance, noise, points), points
+    return noise, points
 
 
 class _Region(NamedTuple):

@@ -190,6 +190,7 @@ def measure_blemish(
         return field.figures(depths + field.depths(pattern), edge, deepest, between) - seen
 
     common = own.by_patterns(changed)
+    shared = [None] * len(seen) if common is None else common.tolist()
     length, width = plain[1], plain[2]
     kind = FeatureKind.PROTRUSION
     if sign < 0:
@@ -197,20 +198,15 @@ def measure_blemish(
         least = min(length, width, 3 * _Rule.half_depth * local)
         kind = FeatureKind.DENT if least >= DENT_SHARE * diameter_mm else FeatureKind.PIT
     names = ("height" if sign > 0 else "depth", "length", "width", "area", *(("lost area",) if sign < 0 else ()))
-    values = [
-        plain_value(kind, name, plain[k], random[k], None if common is None else common[k], least=0.0)
-        for k, name in enumerate(names)
-    ]
+    values = [plain_value(kind, name, plain[k], random[k], shared[k], least=0.0) for k, name in enumerate(names)]
     # All of the bias counts here: an indication by noise alone consists of it.
     for k, name in enumerate(names[:3]):
-        shared = None if common is None else common[k]
-        widest = plain_value(kind, name, plain[k], np.hypot(without_bias[k], bias[k]), shared, least=0.0)
+        widest = plain_value(kind, name, plain[k], np.hypot(without_bias[k], bias[k]), shared[k], least=0.0)
         if widest.low <= 0:
             raise NotSignificantError(f"it is not significant relative to its surroundings: {widest.text()}")
     values.insert(1, plain_value(kind, "edge depth", edge, 0.0, None if common is None else 0.0))
     if wall_mm is not None and sign < 0:
-        shared = None if common is None else common[0]
-        values.append(plain_value(kind, "remaining wall", wall_mm - plain[0], random[0], shared))
+        values.append(plain_value(kind, "remaining wall", wall_mm - plain[0], random[0], shared[0]))
     extent = np.array([length, width, depth])
     beneath = 0.0
     if beneath_mm is not None:

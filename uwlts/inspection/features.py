@@ -365,6 +365,20 @@ def plain_value(
     return FeatureValue(name, float(value), unit, float(random), common, float(low), float(high))
 
 
+def linear_value(
+    kind: FeatureKind,
+    name: str,
+    value: float,
+    covariances: tuple[np.ndarray, np.ndarray | None],
+    by: np.ndarray,
+    *,
+    least: float = -np.inf,
+) -> FeatureValue:
+    """Return a value with derivatives ``by`` (K,) by parameters, from their covariances (K, K) by `PointErrors`."""
+    random, common = (None if each is None else float(np.sqrt(by @ each @ by)) for each in covariances)
+    return plain_value(kind, name, value, random or 0.0, common, least=least)
+
+
 def amplitude_value(
     kind: FeatureKind, name: str, vector: np.ndarray, random: np.ndarray, systematic: np.ndarray | None, *, scale: float
 ) -> FeatureValue:

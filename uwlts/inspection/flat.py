@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.stats import norm
 
@@ -22,7 +21,15 @@ from uwlts.fitting.least_squares import robust_std
 from uwlts.fitting.local_surface import project_footprint
 from uwlts.fitting.propagation import PointErrors, group_neighbours
 from uwlts.inspection.bead_profiles import BIAS_FACTOR
-from uwlts.inspection.features import WITHOUT_UNCERTAINTY, Feature, FeatureKind, FeatureValue, Inspection, plain_value
+from uwlts.inspection.features import (
+    WITHOUT_UNCERTAINTY,
+    Feature,
+    FeatureKind,
+    FeatureValue,
+    Inspection,
+    linear_value,
+    plain_value,
+)
 from uwlts.shapes.flat import Circle, Plane
 from uwlts.shapes.step import StepFace, label_step_faces
 from uwlts.storage.cloud import PointCloud
@@ -91,11 +98,11 @@ def inspect_step(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
     residuals = np.concatenate([base.residuals_mm, other.residuals_mm])
     turned = base.axes[:2] @ other.axes[:2].T
     slopes = np.hstack([-base.rows[1:], turned @ other.rows[1:]])
-    random, common = errors.covariances(np.vstack([row, slopes]), residuals, group_neighbours(len(used)))
+    known = errors.covariances(np.vstack([row, slopes]), residuals, group_neighbours(len(used)))
     angle = np.array([base.axes[k] @ other.axes[2] for k in (0, 1)])
     values = (
-        _make_value(FeatureKind.STEP, "height", height, random, common, 0),
-        _make_angle(FeatureKind.STEP, angle, random[1:, 1:], None if common is None else common[1:, 1:]),
+        linear_value(FeatureKind.STEP, "height", height, known, np.eye(3)[0], least=0.0),
+        _make_angle(FeatureKind.STEP, angle, known),
     )
     points = cloud.points_mm[used]
     extent = np.append(np.ptp((points - base.point_mm) @ base.axes[:2].T, axis=0), height)
@@ -143,19 +150,12 @@ def inspect_flange(
     if holes:
         largest = max(holes, key=lambda hole: hole.radius_mm)
         bolts = [hole for hole in holes if hole is not largest]
-        if bolts:
-            usual = float(np.median([hole.radius_mm for hole in bolts]))
-            same = [abs(hole.radius_mm - usual) < _Rule.same_diameter * usual for hole in bolts]
-            notes += [
-                _note_omission(
-                    face,
-                    hole.middle,
-                    f"its diameter is {2 * hole.radius_mm:.4g} mm, that of the others {2 * usual:.4g} mm",
-                )
-                for hole, is_same in zip(bolts, same, strict=True)
-                if not is_same
-            ]
-            bolts = [hole for hole, is_same in zip(bolts, same, strict=True) if is_same]
+        usual = float(np.median([hole.radius_mm for hole in bolts])) if bolts else 0.0
+        for hole in bolts.copy():
+            if abs(hole.radius_mm - usual) >= _Rule.same_diameter * usual:
+                bolts.remove(hole)
+                sizes = f"its diameter is {2 * hole.radius_mm:.4g} mm, that of the others {2 * usual:.4g} mm"
+                notes.append(_note_omission(face, hole.middle, sizes))
         if largest.radius_mm < 1.5 * max((hole.radius_mm for hole in bolts), default=0.0):
             bolts = holes
         else:
@@ -209,34 +209,29 @@ def inspect_gap(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
     along = np.linalg.svd(np.vstack([side - side.mean(axis=0) for side in sides]))[2][0]
     across = np.array([-along[1], along[0]])
     turn = np.stack([along, across])
-    design, rows = [], []
-    for side in sides:
-        t = (side - middle) @ along
-        design.append(np.column_stack([np.ones(len(t)), t]))
-        rows.append(np.linalg.pinv(design[-1]))
-    places = [(side - middle) @ across for side in sides]
-    lines = [row @ place for row, place in zip(rows, places, strict=True)]
-    sign = np.sign(lines[1][0] - lines[0][0])
-    left = np.concatenate([p - d @ line for p, d, line in zip(places, design, lines, strict=True)])
-    weights = sign * np.hstack([-rows[0], rows[1]])
+    # A line through each edge: its place in the middle and its slope.
+    t, place = turn @ (edges.places - middle).T
+    design = np.column_stack([own * term for own in (edges.first, ~edges.first) for term in (np.ones(len(t)), t)])
+    rows = np.linalg.pinv(design)
+    lines = rows @ place
+    sign, left = np.sign(lines[2] - lines[0]), place - design @ lines
+    weights = sign * (rows[2:] - rows[:2])
     noise = max(float(np.sqrt(np.sum(left**2) / max(len(left) - 4, 1))), edges.spacing * _Rule.edge_std)
     random = noise**2 * weights @ weights.T
     # Blur shifts both edges in opposite directions, even if the cloud does not state it.
     common = np.diag([(2 * _Rule.edge_blur * edges.spacing) ** 2, 0.0])
-    order = np.concatenate([np.flatnonzero(edges.first), np.flatnonzero(~edges.first)])
     if edges.patterns is not None:
-        moved = weights @ (edges.patterns[:, order] @ across).T
+        moved = weights @ (edges.patterns @ across).T
         common = common + moved @ moved.T
-    width, slope = sign * (lines[1] - lines[0])
+    width, slope = sign * (lines[2:] - lines[:2])
     kind = FeatureKind.GAP
     angle = float(np.degrees(np.arctan(slope)))
-    stds = [None if each is None else float(np.degrees(np.sqrt(each[1, 1]))) for each in (random, common)]
     values = [
-        _make_value(kind, "width", float(width), random, common, 0),
-        plain_value(kind, "parallelism", abs(angle), stds[0] or 0.0, stds[1], least=0.0),
+        linear_value(kind, "width", float(width), (random, common), np.array([1.0, 0.0]), least=0.0),
+        linear_value(kind, "parallelism", abs(angle), (random, common), np.array([0.0, np.degrees(1.0)]), least=0.0),
     ]
     local = (cloud.points_mm - face.point_mm) @ face.axes[:2].T - middle
-    side = sign * (local @ across - np.mean([line[0] for line in lines]))
+    side = sign * (local @ across - 0.5 * (lines[0] + lines[2]))
     clear = 0.5 * abs(float(width)) + 2 * edges.spacing
     plates = [np.flatnonzero(side < -clear), np.flatnonzero(side > clear)]
     values.append(_measure_flush(cloud, face, plates, middle))
@@ -326,19 +321,14 @@ def _fit_face(cloud: PointCloud, chosen: np.ndarray) -> _Face:
     return _Face(fit.point_mm, axes, local[:, 2], rows, fit.std_mm)
 
 
-def _make_value(
-    kind: FeatureKind, name: str, value: float, random: np.ndarray, common: np.ndarray | None, at: int
+def _make_angle(
+    kind: FeatureKind, slopes: np.ndarray, covariances: tuple[np.ndarray, np.ndarray | None]
 ) -> FeatureValue:
-    shared = None if common is None else float(np.sqrt(common[at, at]))
-    return plain_value(kind, name, value, float(np.sqrt(random[at, at])), shared, least=0.0)
-
-
-def _make_angle(kind: FeatureKind, slopes: np.ndarray, random: np.ndarray, common: np.ndarray | None) -> FeatureValue:
-    """Return the angle in deg between two planes whose slopes differ by (2,)."""
+    """Return the angle in deg between two planes; the difference (2,) of their slopes comes last in the covariances."""
     size = float(np.linalg.norm(slopes))
     along = slopes / size if size > 0 else np.array([1.0, 0.0])
-    stds = [None if each is None else float(np.degrees(np.sqrt(along @ each @ along))) for each in (random, common)]
-    return plain_value(kind, "parallelism", float(np.degrees(np.arctan(size))), stds[0] or 0.0, stds[1], least=0.0)
+    by = np.append(np.zeros(len(covariances[0]) - 2), np.degrees(along))
+    return linear_value(kind, "parallelism", float(np.degrees(np.arctan(size))), covariances, by, least=0.0)
 
 
 def _make_inspection(
@@ -430,13 +420,8 @@ def _find_gaps(cloud: PointCloud, face: _Face, used: np.ndarray) -> list[_Edges]
     number = np.unique(cloud.frame, return_inverse=True)[1]
     image = number[own[at]]
     lower, upper = line[at], line[at + 1]
-    before, after = [], []
-    for k in range(len(at)):
-        neighbours = np.flatnonzero((image == image[k] + 1) & (lower <= upper[k]) & (upper >= lower[k]))
-        before += [k] * len(neighbours)
-        after += neighbours.tolist()
-    graph = coo_array((np.ones(len(before)), (before, after)), shape=(len(at), len(at)))
-    labels = connected_components(graph, directed=False)[1]
+    overlaps = (image == image[:, None] + 1) & (lower <= upper[:, None]) & (upper >= lower[:, None])
+    labels = connected_components(overlaps, directed=False)[1]
     result = []
     known = cloud.uncertainty
     for label in np.unique(labels):
@@ -563,27 +548,24 @@ def _measure_parallelism(cloud: PointCloud, face: _Face, used: np.ndarray, datum
         random = random + by_noise
         if by_common is not None:
             common = by_common if common is None else common + by_common
-    return _make_angle(FeatureKind.FLANGE, slopes, random, common)
+    return _make_angle(FeatureKind.FLANGE, slopes, (random, common))
 
 
 def _measure_flush(cloud: PointCloud, face: _Face, plates: list[np.ndarray], middle: np.ndarray) -> FeatureValue:
     """Return the offset of two plates along the normal at a place between them."""
     if min(map(len, plates)) < _Rule.fewest_points:
         raise EvaluationError(f"the smaller plate has {min(map(len, plates))} points; {_Rule.fewest_points} are needed")
-    parts, used, residuals = [], [], []
+    parts = []
     for sign, chosen in zip((-1.0, 1.0), plates, strict=True):
         local = (cloud.points_mm[chosen] - face.point_mm) @ face.axes.T
-        near = np.abs(local[:, 2] - np.median(local[:, 2])) < _Rule.off_face * max(
-            robust_std(local[:, 2] - np.median(local[:, 2])), 1e-9
-        )
+        off = local[:, 2] - np.median(local[:, 2])
+        near = np.abs(off) < _Rule.off_face * max(robust_std(off), 1e-9)
         chosen, local = chosen[near], local[near]
         design = np.column_stack([np.ones(len(local)), local[:, :2] - middle])
         rows = np.linalg.solve(design.T @ design, design.T)
-        parts.append(sign * rows[0])
-        used.append(chosen)
-        residuals.append(local[:, 2] - design @ (rows @ local[:, 2]))
-    both, weights = np.concatenate(used), np.concatenate(parts)[None]
-    offset = float(weights[0] @ ((cloud.points_mm[both] - face.point_mm) @ face.axes[2]))
+        parts.append((sign * rows[0], chosen, local[:, 2] - design @ (rows @ local[:, 2])))
+    weights, both, residuals = (np.concatenate(each) for each in zip(*parts, strict=True))
+    offset = float(weights @ ((cloud.points_mm[both] - face.point_mm) @ face.axes[2]))
     errors = PointErrors.along_normals(cloud, both, np.broadcast_to(face.axes[2], (len(both), 3)))
-    random, common = errors.covariances(weights, np.concatenate(residuals), group_neighbours(len(both)))
-    return _make_value(FeatureKind.GAP, "flush", abs(offset), random, common, 0)
+    known = errors.covariances(weights[None], residuals, group_neighbours(len(both)))
+    return linear_value(FeatureKind.GAP, "flush", abs(offset), known, np.ones(1), least=0.0)

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 
 from uwlts.errors import EvaluationError
+from uwlts.evaluation.figure_uncertainty import propagate_figures
 from uwlts.evaluation.figures import FigureUncertainty
 from uwlts.fitting.least_squares import fit_robustly
 from uwlts.fitting.propagation import PointErrors, noise_shifts
@@ -95,11 +96,11 @@ def fit_shape_near(cloud: PointCloud, place_mm: np.ndarray, radius_mm: float, sh
     robust = fit_robustly(fit, points)
     used = near[robust.inliers]
     figures = _figures(robust.fit)
-    stated = propagate_figures(cloud, used, lambda moved: _figures(fit(moved)))
+    stated = _state_uncertainty(cloud, used, lambda moved: _figures(fit(moved)))
     return PickedMeasurement(shape, figures, stated, len(used), robust.rejected)
 
 
-def propagate_figures(
+def _state_uncertainty(
     cloud: PointCloud, used: np.ndarray, measure: Callable[[np.ndarray], dict[str, float]]
 ) -> dict[str, FigureUncertainty]:
     """Return the uncertainties of figures that ``measure`` returns for positions (K, 3) of used points (K,) of a cloud.
@@ -108,16 +109,8 @@ def propagate_figures(
     """
     if (known := cloud.uncertainty) is None:
         return {}
-    points = cloud.points_mm[used]
-    figures = measure(points)
-
-    def changed(moves: np.ndarray) -> list[float]:
-        moved = measure(points + moves)
-        return [moved[name] - value for name, value in figures.items()]
-
-    random, systematic = PointErrors.from_uncertainty(known[used], cloud.frame[used]).propagate(changed, draws=_DRAWS)
-    assert systematic is not None
-    return {name: FigureUncertainty(float(r), float(s)) for name, r, s in zip(figures, random, systematic, strict=True)}
+    points, errors = cloud.points_mm[used], PointErrors.from_uncertainty(known[used], cloud.frame[used])
+    return propagate_figures(errors, measure(points), lambda moves: measure(points + moves), draws=_DRAWS)
 
 
 def _figures(fit: Sphere | Plane | Cylinder) -> dict[str, float]:
@@ -208,5 +201,5 @@ def measure_step(section: Section, first_mm: float, second_mm: float, *, width_m
         lower, upper, slope = np.linalg.lstsq(table, points[:, 2], rcond=None)[0]
         return {"height": float((lower - upper) / np.hypot(1.0, slope))}
 
-    stated = propagate_figures(section.cloud, used, measure)
+    stated = _state_uncertainty(section.cloud, used, measure)
     return PickedMeasurement("step", measure(section.cloud.points_mm[used]), stated, len(used), 0)

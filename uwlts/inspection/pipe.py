@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 
@@ -101,12 +101,17 @@ def inspect_pipe(
         )
     if len(cloud) < _FEWEST_POINTS:
         raise EvaluationError(f"the cloud has {len(cloud)} points; at least {_FEWEST_POINTS} are needed for a pipe")
-    part = find_straight_pipe(cloud, largest_ovality=largest_ovality)
-    form = part.form
+    form, left_out, regions = find_straight_pipe(cloud, largest_ovality=largest_ovality)
     of_size = _check_size(2 * form.radius_mm, wall_mm)
     on_pipe = np.abs(form.distance_mm) < _OFF_SURFACE * form.radius_mm
-    off = _note_points_off(form, on_pipe, part.left_out)
-    chosen = np.flatnonzero(on_pipe & ~part.left_out)
+    off = []
+    if stray := np.count_nonzero(is_off := ~(on_pipe | left_out)):
+        inside, limit = np.count_nonzero(is_off & (form.distance_mm < 0)), _OFF_SURFACE * form.radius_mm
+        off.append(
+            f"{stray} of {len(cloud)} points are {limit:.2g} mm or more off the pipe ({inside} inside) and are "
+            "omitted: a finding beside them is not seen whole"
+        )
+    chosen = np.flatnonzero(on_pipe & ~left_out)
     welds = find_welds(form, chosen)
     on_weld = np.any([weld.covers for weld in welds], axis=0) if welds else np.zeros(len(cloud), bool)
     chosen = chosen[~on_weld[chosen]]
@@ -125,7 +130,7 @@ def inspect_pipe(
     deviation, level = np.full(len(cloud), np.nan), np.full(len(cloud), np.nan)
     deviation[chosen[~search.outliers]] = form.distance_mm[chosen[~search.outliers]]
     level[chosen] = search.level_mm
-    notes = *part.notes, *_note_limits(cloud, form, search), *of_size, *off, *of_sections, *on_welds, *of_blemishes
+    notes = *regions, *_note_limits(cloud, form, search), *of_size, *off, *of_sections, *on_welds, *of_blemishes
     found = Inspection("pipe", (*features, *of_welds, *blemishes), deviation, level, notes)
     return found.consider_cloud(cloud)
 
@@ -204,7 +209,6 @@ def _join_copies(search: BlemishSearch, copied: np.ndarray, count: int) -> Blemi
         outliers=search.outliers[:count],
         undamaged=undamaged,
         level_mm=search.level_mm[:count],
-        noise_mm=search.noise_mm[:count],
     )
 
 
@@ -348,31 +352,27 @@ def _blemish_features(
         axes = np.array([form.frame.axes[2], np.cross(out, form.frame.axes[2]), out])
         extent = np.array([0.0, 0.0, height])
         features.append(Feature(kind, f"{kind} {numbers[kind]}", (value,), place, axes, extent, points, reason=reason))
-    return features, [*_note_spacing([each[0] for each in measured]), *notes]
+    if measured:
+        along, around = np.median([blemish.spacing_mm for blemish, *_ in measured], axis=0)
+        spacing = f"{along:.2g} mm along the pipe, {around:.2g} mm around it, median"
+        notes.insert(
+            0,
+            "lengths and widths of findings are known no better than the spacing of profiles and points there "
+            f"({spacing}): their intervals include it at both ends",
+        )
+    return features, notes
 
 
-def _note_spacing(blemishes: list[Blemish]) -> list[str]:
-    """Return a note on the spacing that the intervals of lengths include; empty without blemishes."""
-    if not blemishes:
-        return []
-    along, around = np.median([each.spacing_mm for each in blemishes], axis=0)
-    return [
-        f"lengths and widths of findings are known no better than the spacing of profiles and points there "
-        f"({along:.2g} mm along the pipe, {around:.2g} mm around it, median): their intervals include it at both ends"
-    ]
-
-
-def _note_merged(feature: Feature) -> list[str]:
-    """Return a note on a finding that consists of several neighbours."""
-    if not len(feature.hollows_mm):
-        return []
-    away = np.linalg.norm(feature.hollows_mm[1:] - feature.hollows_mm[0], axis=1)
-    places = " and ".join(f"{each:.1f} mm" for each in sorted(away))
-    return [
-        f"{feature.name} is {len(feature.hollows_mm)} neighbours that the search joined, {places} from the deepest: "
-        "its depth is that of the deepest, its length and width those of the contour around that one; measure the "
-        "others on their own"
-    ]
+def _note_merged(feature: Feature) -> Iterator[str]:
+    """Yield a note on a finding that consists of several neighbours."""
+    if len(feature.hollows_mm):
+        away = np.linalg.norm(feature.hollows_mm[1:] - feature.hollows_mm[0], axis=1)
+        places = " and ".join(f"{each:.1f} mm" for each in sorted(away))
+        yield (
+            f"{feature.name} is {len(feature.hollows_mm)} neighbours that the search joined, {places} from the "
+            "deepest: its depth is that of the deepest, its length and width those of the contour around that one; "
+            "measure the others on their own"
+        )
 
 
 def _note_indication(cloud: PointCloud, points: np.ndarray, height_mm: float, text: str) -> str:
@@ -381,36 +381,22 @@ def _note_indication(cloud: PointCloud, points: np.ndarray, height_mm: float, te
     return f"an indication of {height_mm:.2g} mm at ({x:.1f}, {y:.1f}, {z:.1f}) mm {text}"
 
 
-def _note_limits(cloud: PointCloud, form: PipeForm, search: BlemishSearch) -> list[str]:
-    notes = []
+def _note_limits(cloud: PointCloud, form: PipeForm, search: BlemishSearch) -> Iterator[str]:
     if cloud.uncertainty is None:
-        notes.append(WITHOUT_UNCERTAINTY)
+        yield WITHOUT_UNCERTAINTY
     if not form.is_seen_round:
         seen = np.degrees(form.arc)
-        notes.append(
+        yield (
             f"the cloud shows {seen:.0f} deg of the circumference, too little for the ovality: the interval of the "
             f"diameter includes the effect of an ovality of up to {100 * form.largest_ovality:g} %"
         )
     level = float(np.nanmedian(search.level_mm)) if np.isfinite(search.level_mm).any() else np.nan
-    notes.append(
+    yield (
         f"blemishes of {2 * search.smallest_mm:.2g} mm diameter are significant from {level:.2g} mm depth (median), "
         f"larger ones from less; the probability of any false indication is {search.false_alarm:g}"
     )
     if stray := np.count_nonzero(search.outliers):
-        notes.append(
+        yield (
             f"{stray} of {len(search.outliers)} points are left out as stray points: each departs from its neighbours "
             f"by more than {SEARCH_RULE.outlier:g} standard deviations, and too few beside it do"
         )
-    return notes
-
-
-def _note_points_off(form: PipeForm, on_pipe: np.ndarray, left_out: np.ndarray) -> list[str]:
-    """Return a note on the points that are neither ``on_pipe`` (N,) nor ``left_out`` (N,) with a region, if any."""
-    off, limit = ~(on_pipe | left_out), _OFF_SURFACE * form.radius_mm
-    if not off.any():
-        return []
-    inside = int(np.count_nonzero(off & (form.distance_mm < 0)))
-    return [
-        f"{np.count_nonzero(off)} of {len(off)} points are {limit:.2g} mm or more off the pipe ({inside} inside) and "
-        "are omitted: a finding beside them is not seen whole"
-    ]

@@ -10,7 +10,7 @@ import numpy as np
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import fit_biweight, fit_robustly, thin_evenly
 from uwlts.fitting.propagation import PointErrors, group_neighbours
-from uwlts.inspection.features import Feature, FeatureKind, FeatureValue, amplitude_value, plain_value
+from uwlts.inspection.features import Feature, FeatureKind, FeatureValue, amplitude_value, linear_value
 from uwlts.shapes.cylinder import Cylinder
 from uwlts.storage.cloud import PointCloud
 
@@ -48,6 +48,7 @@ class PipeFormRule:
 
 FORM_RULE = PipeFormRule()
 
+_ROUND_TERMS = "1", "cos", "sin", "cos 2", "sin 2"  # terms of the radial distance in a section
 _AT_A_TIME = 250_000  # points whose terms are evaluated together, limited by memory
 
 
@@ -61,12 +62,6 @@ class PipeFrame:
 
     point_mm: np.ndarray  # (3,); point on the axis
     axes: np.ndarray  # (3, 3); unit vectors in rows: two directions across, and the axis
-
-    @classmethod
-    def about(cls, cylinder: Cylinder, points_mm: np.ndarray) -> PipeFrame:
-        """Return the frame of a cylinder, with its point in the middle of points (N, 3)."""
-        point, axis = cylinder.point_mm, cylinder.axis
-        return cls(point + axis * np.median((points_mm - point) @ axis), np.array([*cylinder.across, axis]))
 
     def shift_and_tilt(self, shift: np.ndarray, slopes: np.ndarray) -> PipeFrame:
         """Return the frame shifted by (2,) mm, with its axis tilted by slopes (2,), along the directions across."""
@@ -133,7 +128,10 @@ def fit_pipe(cloud: PointCloud, *, largest_ovality: float = LARGEST_OVALITY, sta
     fitted = thin_evenly(np.arange(len(cloud)), FORM_RULE.most_points)
     points = cloud.points_mm[fitted]
     start = start or fit_robustly(Cylinder.fit, thin_evenly(points, FORM_RULE.start_points)).fit
-    return _fit_from(cloud, fitted, PipeFrame.about(start, points), start.radius_mm, largest_ovality)
+    point, axis = start.point_mm, start.axis
+    # The frame's point is in the middle of the points.
+    frame = PipeFrame(point + axis * np.median((points - point) @ axis), np.array([*start.across, axis]))
+    return _fit_from(cloud, fitted, frame, start.radius_mm, largest_ovality)
 
 
 def refit_pipe(cloud: PointCloud, form: PipeForm, *, left_out: np.ndarray) -> PipeForm:
@@ -221,7 +219,7 @@ def pipe_features(
         raise EvaluationError(f"section_mm is {section_mm:g}; expected a positive length in mm")
     count = max(1, int(length / section_mm)) if section_mm else FORM_RULE.most_sections
     edges = low + length * np.arange(count + 1) / count
-    terms = ("1", "cos", "sin", "cos 2", "sin 2") if form.is_seen_round else ("1",)
+    terms = _ROUND_TERMS if form.is_seen_round else ("1",)
     raw = form.distance_mm + _evaluate_terms(form.along_mm, form.angle, form.scale_mm, form.terms, form.coefficients)
     notes: list[str] = []
     for start, end in pairwise(edges):
@@ -238,11 +236,10 @@ def pipe_features(
         weights = np.linalg.pinv(design, rcond=1e-6)
         coefficients = weights @ raw[own]
         middle = form.frame.point_mm + 0.5 * (start + end) * form.frame.axes[2]
-        if "sin" in terms:
+        if form.is_seen_round:
             middle = middle + coefficients[1] * form.frame.axes[0] + coefficients[2] * form.frame.axes[1]
-        if "sin" in terms:
             left = raw[own] - design @ coefficients
-            values = _section_values(form, errors[inside], weights, coefficients, terms, left)
+            values = _section_values(form, errors[inside], weights, coefficients, left)
         else:
             values = (_arc_diameter(form, errors, inside, weights[0], float(coefficients[0])),)
         size = np.array([extent[0], extent[1], end - start])
@@ -257,75 +254,55 @@ def _whole_values(form: PipeForm, errors: PointErrors) -> tuple[FeatureValue, ..
     if not form.is_seen_round:
         by_ovality = form.weights @ _unseen_ovality(form, used)
         common = by_ovality @ by_ovality.T + (0.0 if common is None else common)
-    place = {term: k for k, term in enumerate(form.terms)}
-
-    def covariances(*terms: str, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray | None]:
-        at = [place[term] for term in terms]
-        part = scale**2 * random[np.ix_(at, at)]
-        return part, None if common is None else scale**2 * common[np.ix_(at, at)]
 
     def plain(name: str, value: float, term: str, scale: float) -> FeatureValue:
-        by_noise, by_common = covariances(term, scale=scale)
-        shared = None if by_common is None else float(np.sqrt(by_common[0, 0]))
-        return plain_value(kind, name, value, float(np.sqrt(by_noise[0, 0])), shared)
+        return linear_value(kind, name, value, (random, common), scale * (np.array(form.terms) == term))
+
+    def amplitude(name: str, terms: str, scale: float) -> FeatureValue:
+        at = [form.terms.index(terms.format(each)) for each in ("cos", "sin")]
+        return amplitude_value(kind, name, coefficients[at], *_part_of(at, random, common), scale=scale)
 
     values = [plain("diameter", diameter, "1", 2.0)]
-    if "cos 2" in place:
-        vector = coefficients[[place["cos 2"], place["sin 2"]]]
-        two = covariances("cos 2", "sin 2")
+    if form.is_seen_round:
         # The diameter varies by four amplitudes of the second harmonic of the radius.
-        values.append(amplitude_value(kind, "ovality", vector, *two, scale=4.0))
-        values.append(amplitude_value(kind, "ovality share", vector, *two, scale=400.0 / diameter))
+        values.append(amplitude("ovality", "{} 2", 4.0))
+        values.append(amplitude("ovality share", "{} 2", 400.0 / diameter))
     length, scale = float(np.ptp(form.along_mm[used])), form.scale_mm
-    vector = coefficients[[place["along2 cos"], place["along2 sin"]]]
     # A parabola a (x / scale)^2 over a length has the sagitta a (length / 2 / scale)^2.
-    values.append(
-        amplitude_value(
-            kind, "straightness", vector, *covariances("along2 cos", "along2 sin"), scale=(0.5 * length / scale) ** 2
-        )
-    )
+    values.append(amplitude("straightness", "along2 {}", (0.5 * length / scale) ** 2))
     stated = int(np.argmax(np.abs(form.frame.axes[2])))
     for number, term in ((1, "cos"), (2, "sin")):
         across = form.frame.axes[number - 1]
         values.append(plain(f"axis place {number}", float(across @ form.frame.point_mm), term, 1.0))
-        slope = float(
-            np.degrees(np.arctan2(form.frame.axes[2] @ _square_part(across, stated), form.frame.axes[2, stated]))
-        )
+        # Direction perpendicular to the stated coordinate axis.
+        level = np.where(np.arange(3) == stated, 0.0, across)
+        level /= max(float(np.linalg.norm(level)), 1e-12)
+        slope = float(np.degrees(np.arctan2(form.frame.axes[2] @ level, form.frame.axes[2, stated])))
         values.append(plain(f"axis slope {number}", slope, f"along {term}", float(np.degrees(1 / scale))))
     return tuple(values)
 
 
-def _square_part(across: np.ndarray, stated: int) -> np.ndarray:
-    """Return the unit vector along the part of a direction that is perpendicular to a coordinate axis."""
-    level = across.copy()
-    level[stated] = 0.0
-    return level / max(float(np.linalg.norm(level)), 1e-12)
+def _part_of(at: list[int], random: np.ndarray, common: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return the covariances of some parameters."""
+    return random[np.ix_(at, at)], None if common is None else common[np.ix_(at, at)]
 
 
 def _section_values(
-    form: PipeForm,
-    errors: PointErrors,
-    weights: np.ndarray,
-    coefficients: np.ndarray,
-    terms: tuple[str, ...],
-    left: np.ndarray,
+    form: PipeForm, errors: PointErrors, weights: np.ndarray, coefficients: np.ndarray, left: np.ndarray
 ) -> tuple[FeatureValue, ...]:
-    kind = FeatureKind.SECTION
-    random, common = errors.covariances(weights, left, group_neighbours(len(left)))
-    shared = None if common is None else 2 * float(np.sqrt(common[0, 0]))
-    diameter = 2 * (form.radius_mm + coefficients[0])
-    values = [plain_value(kind, "diameter", float(diameter), 2 * float(np.sqrt(random[0, 0])), shared)]
-    if "cos 2" in terms:
-        at = [terms.index("cos 2"), terms.index("sin 2")]
-        two = random[np.ix_(at, at)], None if common is None else common[np.ix_(at, at)]
-        vector = coefficients[at]
-        values.append(amplitude_value(kind, "ovality", vector, *two, scale=4.0))
-        size = max(float(np.linalg.norm(vector)), 1e-12)
-        side = np.array([-vector[1], vector[0]]) / size**2 / 2
-        stds = [None if each is None else float(np.degrees(np.sqrt(side @ each @ side))) for each in two]
-        angle = 0.5 * float(np.degrees(np.arctan2(vector[1], vector[0])))
-        values.append(plain_value(kind, "ovality angle", angle, stds[0] or 0.0, stds[1]))
-    return tuple(values)
+    """Return the values of a section from the coefficients (5,) of `_ROUND_TERMS`, with residuals ``left`` (K,)."""
+    kind, at = FeatureKind.SECTION, [3, 4]
+    known = errors.covariances(weights, left, group_neighbours(len(left)))
+    diameter = float(2 * (form.radius_mm + coefficients[0]))
+    vector, two = coefficients[at], _part_of(at, *known)
+    size = max(float(np.linalg.norm(vector)), 1e-12)
+    side = np.degrees(np.array([-vector[1], vector[0]]) / size**2 / 2)
+    angle = 0.5 * float(np.degrees(np.arctan2(vector[1], vector[0])))
+    return (
+        linear_value(kind, "diameter", diameter, known, 2 * np.eye(5)[0]),
+        amplitude_value(kind, "ovality", vector, *two, scale=4.0),
+        linear_value(kind, "ovality angle", angle, known, np.append(np.zeros(3), side)),
+    )
 
 
 def _arc_diameter(
@@ -343,9 +320,9 @@ def _arc_diameter(
     whole[inside] += weights
     random, common = errors.covariances(whole[None], form.distance_mm[form.used], _neighbourhoods(form, form.used))
     by_ovality = whole @ _unseen_ovality(form, form.used)
-    variance = float(by_ovality @ by_ovality) + (0.0 if common is None else float(common[0, 0]))
-    std = 2 * float(np.sqrt(random[0, 0])), 2 * float(np.sqrt(variance))
-    return plain_value(FeatureKind.SECTION, "diameter", 2 * (form.radius_mm + off), *std)
+    common = np.array([[by_ovality @ by_ovality]]) + (0.0 if common is None else common)
+    diameter = 2 * (form.radius_mm + off)
+    return linear_value(FeatureKind.SECTION, "diameter", diameter, (random, common), np.array([2.0]))
 
 
 def _unseen_ovality(form: PipeForm, points: np.ndarray) -> np.ndarray:

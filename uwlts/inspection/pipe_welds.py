@@ -98,7 +98,7 @@ def measure_weld(cloud: PointCloud, form: PipeForm, weld: PipeWeld, name: str) -
         tangents = np.stack([tangents[:, 1], -around], axis=1)
         local[:, 1] *= -1
     axes = np.array([*tangents[nearest], out[nearest]])
-    bead = build_bead(cloud, local, axes, middle, tangents, half_mm=weld.half_mm)
+    bead = build_bead(cloud, local, tangents, half_mm=weld.half_mm)
     errors = PointErrors.along_normals(cloud, bead.chosen, out[bead.chosen])
     values, extent, _ = measure_bead(bead, errors)
     return Feature(FeatureKind.WELD, name, values, middle, axes, extent, bead.chosen[bead.on_bead])

@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import MAD_TO_STD, robust_std, thin_evenly
 from uwlts.inspection.pipe_form import FORM_RULE, PipeForm, fit_pipe, refit_pipe
-from uwlts.shapes.cylinder import Cylinder
+from uwlts.shapes.cylinder import Cylinder, local_normals
 from uwlts.shapes.flat import Circle
 from uwlts.storage.cloud import PointCloud
 
@@ -51,17 +51,10 @@ class _Rule:
     coarse: float = 0.35  # distance of neighbouring points, divided by the radius, that does not show a pipe
 
 
-@dataclass(frozen=True, eq=False)
-class ScannedPart:
-    """Straight pipe in a cloud of N points."""
-
-    form: PipeForm
-    left_out: np.ndarray  # (N,) bool; points of other bodies and of covered regions
-    notes: tuple[str, ...]  # regions that are not inspected
-
-
-def find_straight_pipe(cloud: PointCloud, *, largest_ovality: float) -> ScannedPart:
+def find_straight_pipe(cloud: PointCloud, *, largest_ovality: float) -> tuple[PipeForm, np.ndarray, tuple[str, ...]]:
     """Find the straight pipe in a cloud and what else is there.
+
+    Returns its form, a mask (N,) of points of other bodies and of covered regions, and notes on these.
 
     Raises EvaluationError with the name of the part if it is no straight pipe, or if its bare surface is not seen
     sufficiently.
@@ -92,7 +85,7 @@ def find_straight_pipe(cloud: PointCloud, *, largest_ovality: float) -> ScannedP
     if notes:
         left_out = cells.points_in(beside)
         form = refit_pipe(cloud, form, left_out=left_out)
-    return ScannedPart(form, left_out, tuple(notes))
+    return form, left_out, tuple(notes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,9 +286,7 @@ def _fit_torus(points: np.ndarray) -> tuple[float, float, float, float] | None:
     middle = points.mean(axis=0)
     scale = float(np.sqrt(np.mean(np.sum((points - middle) ** 2, axis=1))))
     places = (points - middle) / scale
-    patches: Any = places[np.asarray(KDTree(places).query(places, k=12)[1])]
-    patches = patches - patches.mean(axis=1, keepdims=True)
-    normals = np.linalg.eigh(np.swapaxes(patches, 1, 2) @ patches)[1][:, :, 0]
+    normals = local_normals(places)
     lines = np.hstack([np.cross(places, normals), normals])
     best = None
     # A cylinder has two such complexes; the second one of a nearly straight bend may be its axis.

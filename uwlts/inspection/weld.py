@@ -114,18 +114,21 @@ def inspect_weld(cloud: PointCloud | str | os.PathLike[str], *, section_mm: floa
         raise EvaluationError(
             f"the cloud has {len(cloud)} points; at least {_Rule.fewest_points} are needed for a weld"
         )
-    bead, notes = _prepare_bead(cloud, section_mm)
-    errors = PointErrors.along_normals(cloud, bead.chosen, np.broadcast_to(bead.axes[2], (len(bead.chosen), 3)))
+    axes, middle, half, ends, others = _locate_bead(cloud.points_mm)
+    local = (cloud.points_mm - middle) @ axes.T
+    local[(local[:, 0] < ends[0]) | (local[:, 0] > ends[1])] = np.inf
+    tangents = np.broadcast_to(axes[:2], (len(cloud), 2, 3))
+    bead = build_bead(cloud, local, tangents, half_mm=half, section_mm=section_mm)
+    errors = PointErrors.along_normals(cloud, bead.chosen, np.broadcast_to(axes[2], (len(bead.chosen), 3)))
     values, extent, left_out = measure_bead(bead, errors)
-    feature = Feature(FeatureKind.WELD, "weld", values, bead.middle_mm, bead.axes, extent, bead.chosen[bead.on_bead])
+    feature = Feature(FeatureKind.WELD, "weld", values, middle, axes, extent, bead.chosen[bead.on_bead])
     deviation = np.full(len(cloud), np.nan)
     deviation[bead.chosen] = bead.heights_mm
     count = bead.profiles.sections
-    notes = [
-        f"{count} sections of {bead.length_mm / count:.2g} mm; the second axis points from left to right",
-        *notes,
-        *left_out,
-    ]
+    notes = [f"{count} sections of {bead.length_mm / count:.2g} mm; the second axis points from left to right"]
+    if others:
+        notes.append(f"{others} other beads beside the highest one are not measured: crop the cloud to measure them")
+    notes += left_out
     if cloud.uncertainty is None:
         notes.append(WITHOUT_UNCERTAINTY)
     return Inspection("weld", (feature,), deviation, np.full(len(cloud), np.nan), tuple(notes)).consider_cloud(cloud)
@@ -135,8 +138,6 @@ def inspect_weld(cloud: PointCloud | str | os.PathLike[str], *, section_mm: floa
 class Bead:
     """Bead with its plates."""
 
-    axes: np.ndarray  # (3, 3); unit vectors along the bead, across it and outwards
-    middle_mm: np.ndarray  # (3,); middle of the bead
     chosen: np.ndarray  # (n,) int; points on the bead and on the plates
     raw_mm: np.ndarray  # (n,); heights of these points above the middle
     heights_mm: np.ndarray  # (n,); heights of these points above the plates
@@ -149,34 +150,14 @@ class Bead:
     footprint_std: float  # relative standard uncertainty of the squared footprints
 
 
-def _prepare_bead(cloud: PointCloud, section_mm: float | None) -> tuple[Bead, list[str]]:
-    """Return the highest bead with its plates and profiles, and notes on other beads."""
-    axes, middle, half, ends, others = _locate_bead(cloud.points_mm)
-    notes = [f"{others} other beads beside the highest one are not measured: crop the cloud to measure them"] * (
-        others > 0
-    )
-    local = (cloud.points_mm - middle) @ axes.T
-    local[(local[:, 0] < ends[0]) | (local[:, 0] > ends[1])] = np.inf
-    tangents = np.broadcast_to(axes[:2], (len(cloud), 2, 3))
-    return build_bead(cloud, local, axes, middle, tangents, half_mm=half, section_mm=section_mm), notes
-
-
 def build_bead(
-    cloud: PointCloud,
-    local: np.ndarray,
-    axes: np.ndarray,
-    middle: np.ndarray,
-    tangents: np.ndarray,
-    *,
-    half_mm: float,
-    section_mm: float | None = None,
+    cloud: PointCloud, local: np.ndarray, tangents: np.ndarray, *, half_mm: float, section_mm: float | None = None
 ) -> Bead:
     """Return a bead with its plates and profiles.
 
     ``local`` (N, 3) are places along the bead, across it and heights, mm; not finite for points that do not count.
-    ``axes`` (3, 3) are unit vectors along the bead, across it and outwards in its ``middle`` (3,); ``tangents`` (N, 2,
-    3) those along and across at the points. ``half_mm`` is the approximate half width, ``section_mm`` the length of a
-    section.
+    ``tangents`` (N, 2, 3) are unit vectors along and across it at the points. ``half_mm`` is the approximate half
+    width, ``section_mm`` the length of a section.
 
     Raises EvaluationError if the points do not show the plates on both sides of the bead.
     """
@@ -198,7 +179,10 @@ def build_bead(
     if section_mm is not None:
         count = max(1, int(length / section_mm))
     section = np.clip(((along - along.min()) / length * count).astype(int), 0, count - 1)
-    gap = _typical_gap(across, section)
+    # The gap between points of a section that contains the median place across.
+    order = np.lexsort((across, section))
+    gaps = np.sort(np.diff(across[order])[np.diff(section[order]) == 0])
+    gap = float(gaps[np.searchsorted(np.cumsum(gaps), 0.5 * gaps.sum())])
     spacing = max(2 * reach * count / len(along), _Rule.gap_spacings * gap)
     bandwidth = max(_Rule.bandwidth * 2 * half, _Rule.spacings_in_bandwidth * spacing)
     edge = half * (1 + 2 * _Rule.groove_outside) + bandwidth
@@ -220,15 +204,7 @@ def build_bead(
     scatter = _local_scatter(profiles, raw, across, bandwidth)
     seen = seen * np.maximum(scatter / float(np.median(scatter[np.abs(across) > half * (1 + _Rule.groove_outside)])), 1)
     on_bead = np.abs(across) < half
-    return Bead(axes, middle, chosen, raw, heights, on_bead, half, length, gap, seen, profiles, footprint_std)
-
-
-def _typical_gap(across: np.ndarray, section: np.ndarray) -> float:
-    """Return the gap between points of a section that contains the median place across."""
-    order = np.lexsort((across, section))
-    gaps = np.diff(across[order])[np.diff(section[order]) == 0]
-    gaps = np.sort(gaps)
-    return float(gaps[np.searchsorted(np.cumsum(gaps), 0.5 * gaps.sum())])
+    return Bead(chosen, raw, heights, on_bead, half, length, gap, seen, profiles, footprint_std)
 
 
 def _local_scatter(profiles: BeadProfiles, raw: np.ndarray, across: np.ndarray, bandwidth: float) -> np.ndarray:

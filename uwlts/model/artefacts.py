@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
-from uwlts.errors import DescriptionError, EvaluationError, describe_problems
-from uwlts.files.reading import MOST_TOML_BYTES, parse_toml, read_text
+from uwlts.errors import EvaluationError, describe_problems
+from uwlts.files.reading import read_toml
 from uwlts.model.sensor import Description, NotNegative, Positive
 
 _MOST_SPHERES = 6  # of a sphere standard; ball plates with more are not evaluated
@@ -81,9 +81,4 @@ def read_artefact(path: str | Path) -> Artefact:
     Raises CaptureError if the file cannot be read, DescriptionError if it is not TOML, and EvaluationError if it does
     not describe an artefact.
     """
-    text = read_text(path, most_bytes=MOST_TOML_BYTES, called="artefact", foreign="is not valid TOML")
-    try:
-        table = parse_toml(text)
-    except ValueError as error:
-        raise DescriptionError(f"{path} is not valid TOML: {error}") from error
-    return parse_artefact(table)
+    return parse_artefact(read_toml(path, called="artefact"))

@@ -21,7 +21,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from uwlts.errors import DescriptionError, DescriptionWarning, DesignError, Error, list_problems
-from uwlts.files.reading import MOST_TOML_BYTES, is_regular_file, parse_toml, read_text, shorten
+from uwlts.files.reading import is_regular_file, read_toml, shorten
 from uwlts.model.placement import apparent_depth_mm, camera_from_object, laser_pose
 from uwlts.model.sensor import Description, Sensor, Table, Window
 
@@ -29,7 +29,6 @@ AnyDescription = TypeVar("AnyDescription", bound=Description)
 
 
 _MOST_PROBLEMS = 30  # of a description that a message lists
-_NO_TOML = "is not valid TOML"
 _SAME_WAVELENGTH_NM = 5.0  # lasers of the same type differ by less
 _SAME = 0.1  # relative change of a length, an angle or a power that can be an adjustment of the same part
 _BLUR_PX = 2.0
@@ -93,13 +92,9 @@ def read_table(path: Path, folder: str = "") -> Table:
 
 def read_levels(path: Path, folder: str = "", *, seen: tuple[Path, ...] = ()) -> tuple[Level, ...]:
     """Read a TOML file and its chain of bases, each merged with those before it; the first base is first."""
-    text = read_text(path, most_bytes=MOST_TOML_BYTES, error=DescriptionError, called="description", foreign=_NO_TOML)
+    table = read_toml(path, called="description", error=DescriptionError)
     if path.resolve() in seen:
         raise DescriptionError(f"{path} is its own base: {' -> '.join(p.name for p in (*seen, path))}")
-    try:
-        table = parse_toml(text)
-    except ValueError as error:
-        raise DescriptionError(f"{path} {_NO_TOML}: {error}") from error
     base = table.pop("base", None)
     if base is None:
         return (Level(path.stem, table, table),)

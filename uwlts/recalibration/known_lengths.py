@@ -56,7 +56,7 @@ def measure_known_lengths(
     unknown = np.full(len(points.number), np.nan, np.float32)
     cloud = PointCloud((points.places_mm - pose[:3, 3]) @ rotation, unknown, points.image, np.arange(len(unknown)))
     found = evaluate_cloud(cloud, artefact)
-    gradients = linearise_figures(cloud, found).gradients()
+    gradients = linearise_figures(cloud, found).gradients
     figures = [figure for figure in found.figures if figure.key.quantity in _USED]
     if not figures:
         raise EvaluationError(f"a {artefact.kind} has no known length: give a pipe, a step or spheres")

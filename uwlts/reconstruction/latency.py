@@ -34,31 +34,14 @@ _OUTLIER = 4.0
 """Outlier limit in standard deviations; one in 16,000 Gaussian distances exceeds it."""
 
 
-@dataclass(frozen=True)
-class Latency:
-    """Delay ``latency_s`` of the stage positions relative to the camera, with its standard uncertainty ``std_s``.
+def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s: np.ndarray) -> tuple[float, float]:
+    """Measure the latency of the stage positions relative to the camera, s, and its standard uncertainty.
 
-    The true position of a frame is the reported one plus its speed times the latency.
-    """
+    The true position of a frame is the reported one plus its speed times the latency. Passes in both directions over a
+    static surface show it: stripe centres (N, L) of the frames on all profile lines, NaN without a stripe, and
+    positions and signed speeds (N,) of the stage.
 
-    latency_s: float
-    std_s: float
-
-
-def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s: np.ndarray) -> Latency:
-    """Measure the latency from passes in both directions over a static surface.
-
-    Parameters
-    ----------
-    centre_px : (N, L)
-        Stripe centres of each frame on all profile lines; NaN without a stripe.
-    stage_mm, speed_mm_per_s : (N,)
-        Position and signed speed of the stage at each frame.
-
-    Raises
-    ------
-    EvaluationError
-        A pass is missing, or the surface has too little relief along the motion.
+    EvaluationError if a pass is missing, or the surface has too little relief along the motion.
     """
     there, back = (np.flatnonzero(sign * speed_mm_per_s > 0) for sign in (1, -1))
     if min(len(there), len(back)) < 4:
@@ -71,7 +54,7 @@ def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s:
     backward = _Surface.from_centres(stage_mm[back], centre_px[back])
     speed = float(np.median(speed_mm_per_s[there]) - np.median(speed_mm_per_s[back])) / 2
     # A backward frame at x shows the same as the forward pass at x - 2 v latency.
-    step = surface.step_mm / 2
+    step = float(np.median(np.diff(surface.position))) / 2
     reach = int(np.ceil(2 * speed * _LARGEST_S / step))
     ways = step * np.arange(-reach, reach + 1)
     ways = ways[np.argsort(np.abs(ways), kind="stable")]
@@ -105,7 +88,7 @@ def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s:
         if abs(further) < 1e-6:
             break
     std = _GRAIN * float(np.std(away)) * float(np.sqrt((weight**2).sum()) / (weight * slope).sum())
-    return Latency(shift / (2 * speed), std / (2 * speed))
+    return shift / (2 * speed), std / (2 * speed)
 
 
 def _cost(surface: "_Surface", backward: "_Surface", shift: float) -> tuple[float, float]:
@@ -135,11 +118,6 @@ class _Surface:
         smooth = odd < np.maximum(_MOST_BENT_PX, _MOST_BENT * np.abs(across) / 2)
         slope[1:-1] = np.where(smooth, across / apart[:, None], np.nan)
         return cls(position, centre, slope)
-
-    @property
-    def step_mm(self) -> float:
-        """Median distance between frames, mm."""
-        return float(np.median(np.diff(self.position)))
 
     def compare(self, other: "_Surface", shift: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Compare the centres of another pass at x with those of this pass at x - shift.

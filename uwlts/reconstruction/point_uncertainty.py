@@ -135,29 +135,16 @@ def point_uncertainty(
     the stage's position, scale and direction about its central position, and drift of the water since the calibration,
     unless the calibration uses this capture. It excludes errors of poses (`uwlts.reconstruction.moving`).
 
-    Parameters
-    ----------
-    capture, calibration
-        Capture and joint calibration of the points.
-    frame, line, centre_px : (N,)
-        Image, profile line and position of each stripe centre.
-    blur_px : (N,), optional
-        Possible shift of the centres by blur; its relative error is common to all points.
-    beside_mm : (N, 3), optional
-        Applied shift of the points to the origin of their light (`uwlts.optics.brightness`); its relative error is
-        common to all points.
-    mount_by : (6, P), optional
-        Derivatives of a calibrated mount by the parameters of the joint estimate (`uwlts.model.mount.SensorShare`), for
-        frames with poses of a platform. They correlate the errors of points and mount. By default poses and described
-        mount, or the stage, place the true OCS, from which the calibrated one differs by the errors of camera axis and
-        sheet.
-    digest
-        Digest of the calibration, if known.
+    ``frame``, ``line`` and ``centre_px`` (N,) are image, profile line and position of each stripe centre. ``blur_px``
+    (N,) is the possible shift of the centres by blur, ``beside_mm`` (N, 3) the applied shift of the points to the
+    origin of their light (`uwlts.optics.brightness`); their relative errors are common to all points.
 
-    Raises
-    ------
-    CalibrationError
-        The calibration has no joint estimate, or it cannot reconstruct the points.
+    ``mount_by`` (6, P) are the derivatives of a calibrated mount by the parameters of the joint estimate
+    (`uwlts.model.mount.SensorShare`), for frames with poses of a platform. They correlate the errors of points and
+    mount. By default poses and described mount, or the stage, place the true OCS, from which the calibrated one differs
+    by the errors of camera axis and sheet. ``digest`` is that of the calibration, if known.
+
+    CalibrationError if the calibration has no joint estimate, or cannot reconstruct the points.
     """
     header = capture.header
     sensor = header.sensor
@@ -174,7 +161,12 @@ def point_uncertainty(
     middle = np.mean(capture.stage_mm[by_stage_alone]) if by_stage_alone.any() else 0.0
     stage = np.where(by_stage_alone, capture.stage_mm - middle, 0.0)
     root, by_stage = independent_components(known, calibration, header)
-    frame_by = -known.frame_by if mount_by is None else _rotate_to_sensor(mount_by, header)
+    frame_by = -known.frame_by
+    if mount_by is not None:
+        # Translation and rotation, from platform axes to sensor axes.
+        frame_by = np.vstack(
+            [np.array(header.T_platform_sensor)[:3, :3].T @ part for part in (mount_by[:3], mount_by[3:])]
+        )
     rigid = frame_by @ root[: frame_by.shape[1]]
     rigid[0, -1] = window_shift_std_mm(sensor) if mount_by is None else 0.0
     exact = partial(_derivatives, known, root, rigid)
@@ -291,12 +283,6 @@ def window_shift_std_mm(sensor: Sensor) -> float:
     """
     window, tilt = sensor.laser.window, np.radians(sensor.uncertainty.laser_window_tilt_deg)
     return window.thickness_mm * (1 - 1 / window.index(sensor.laser.wavelength_nm)) * tilt if window.mounted else 0.0
-
-
-def _rotate_to_sensor(mount_by: np.ndarray, header: CaptureHeader) -> np.ndarray:
-    """Rotate the derivatives (6, P) of a mount, translation and rotation, from platform axes to sensor axes."""
-    turn = np.array(header.T_platform_sensor)[:3, :3]
-    return np.vstack([turn.T @ mount_by[:3], turn.T @ mount_by[3:]])
 
 
 def _derivatives(

@@ -188,23 +188,11 @@ def reconstruct_stripes(
     brightness gradients (`uwlts.optics.brightness`). It also omits lines whose stripe centre may be shifted more by
     blur than by noise, counted as ``blurred``.
 
-    Parameters
-    ----------
-    capture, stripes, calibration
-        Capture, its stripes, and calibration of the sensor.
-    index
-        Refractive index; by default that of the capture's medium.
-    with_uncertainty
-        Calculate the uncertainty of the points (joint calibration only).
-    mount_by : (6, P), optional
-        As for `point_uncertainty`.
+    ``index`` is the refractive index, by default that of the capture's medium. The uncertainty of the points needs a
+    joint calibration; ``mount_by`` as for `point_uncertainty`.
 
-    Raises
-    ------
-    CalibrationError
-        The calibration does not fit the capture, or an index is given for a polynomial calibration.
-    RangeError
-        The refractive index is outside the range of media.
+    Raises CalibrationError if the calibration does not fit the capture, or an index is given for a polynomial one;
+    RangeError if the index is outside the range of media.
     """
     doubts = check_fits(capture.header, calibration, source=capture.path.name)
     by_stage = not np.isfinite(capture.pose).any()

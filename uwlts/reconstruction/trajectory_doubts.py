@@ -1,5 +1,7 @@
 """Doubts about a trajectory at the images of a scan: units, clocks, outliers, standstill and direction."""
 
+from collections.abc import Iterator
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -25,17 +27,15 @@ _LEAST_ACROSS = 0.1
 """Least part of the motion across the laser sheet: scans along it have no points beside each other."""
 
 
-def find_trajectory_doubts(trajectory: Trajectory, times_s: np.ndarray, sensor_poses: np.ndarray) -> list[str]:
-    """Return warnings about a trajectory, for the poses (N, 4, 4) of the sensor at the times (N,) of N laser images."""
+def find_trajectory_doubts(trajectory: Trajectory, times_s: np.ndarray, sensor_poses: np.ndarray) -> Iterator[str]:
+    """Yield warnings about a trajectory, for the poses (N, 4, 4) of the sensor at the times (N,) of N laser images."""
     if len(times_s) < 2:
-        return []
-    places, known = trajectory.poses[:, :3, 3], trajectory.times_s
-    first, last = times_s.min(), times_s.max()
-    doubts = []
+        return
+    known, first, last = trajectory.times_s, times_s.min(), times_s.max()
     inside = int(np.count_nonzero((known >= first) & (known <= last)))
     cover = (last - first) / (known[-1] - known[0])
     if cover < _LEAST_COVER and inside < len(times_s) / 2:
-        doubts.append(
+        yield (
             f"the images cover {100 * cover:.2g} % of the trajectory's time, with {inside} of its {len(known)} poses: "
             "are its times in s?"
         )
@@ -43,80 +43,70 @@ def find_trajectory_doubts(trajectory: Trajectory, times_s: np.ndarray, sensor_p
     turned = np.linalg.norm(np.diff(turns, axis=0), axis=(1, 2)) / np.sqrt(2)
     way = np.linalg.norm(moves, axis=1)
     if np.mean(way + _REACH_MM * turned) < _SMALLEST_STEP_MM:
-        doubts.append(
+        yield (
             f"the sensor moves by {way.sum():.3g} mm in {len(times_s)} images: does the platform stand still, or are "
             "positions in metres (`pose_unit`)?"
         )
     if way.mean() > _LARGEST_STEP_MM:
-        doubts.append(f"the sensor moves by {way.mean():.4g} mm per image: are positions in mm (`pose_unit`)?")
+        yield f"the sensor moves by {way.mean():.4g} mm per image: are positions in mm (`pose_unit`)?"
     across = np.abs(np.einsum("ni,ni->n", moves, turns[:-1, :, 0]))
     if way.sum() > _REACH_MM * turned.sum() and across.sum() < _LEAST_ACROSS * way.sum():
-        doubts.append(
+        yield (
             f"{100 * across.sum() / way.sum():.2g} % of the motion is across the laser sheet: check the order of "
             "quaternions and angles, and the mount"
         )
-    doubts += [*_find_outliers(known, places), *_find_standstill(trajectory, times_s)]
-    return [*doubts, *_find_opposite_turn(trajectory), *_find_gap(trajectory, times_s)]
+    yield from _find_outliers(trajectory)
+    yield from _find_standstill_and_gaps(trajectory, times_s)
+    yield from _find_opposite_turn(trajectory)
 
 
-def _find_outliers(times: np.ndarray, places: np.ndarray) -> list[str]:
-    """Return a warning about positions (N, 3) far from the line between their neighbours."""
+def _find_outliers(trajectory: Trajectory) -> Iterator[str]:
+    """Yield a warning about positions far from the line between their neighbours."""
+    times, places = trajectory.times_s, trajectory.poses[:, :3, 3]
     if len(times) < 4:
-        return []
+        return
     part = ((times[1:-1] - times[:-2]) / (times[2:] - times[:-2]))[:, None]
     off = np.linalg.norm(places[1:-1] - (1 - part) * places[:-2] - part * places[2:], axis=1)
     steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
     limit = max(_OUTLIER * np.median(off), _STEPS_OF_OUTLIER * np.percentile(steps, 90), _LEAST_OUTLIER_MM)
-    if off[worst := int(np.argmax(off))] <= limit:
-        return []
-    at = format_time(times[worst + 1])
-    return [f"the trajectory jumps by up to {off[worst]:.4g} mm, at {at}: remove outliers, or fill the gap"]
+    if off[worst := int(np.argmax(off))] > limit:
+        at = format_time(times[worst + 1])
+        yield f"the trajectory jumps by up to {off[worst]:.4g} mm, at {at}: remove outliers, or fill the gap"
 
 
-def _find_standstill(trajectory: Trajectory, times_s: np.ndarray) -> list[str]:
-    """Return a warning about images at times at which the trajectory repeats a pose exactly."""
-    same = (trajectory.poses[1:] == trajectory.poses[:-1]).all(axis=(1, 2))
-    # Images between two equal poses.
-    after = np.searchsorted(trajectory.times_s, times_s, side="right") - 1
-    frozen = same[np.clip(after, 0, len(same) - 1)]
-    if np.count_nonzero(frozen) < 2:
-        return []
-    some = times_s[frozen]
-    return [
-        f"{len(some)} of {len(times_s)} images, from {format_time(some[0])} to {format_time(some[-1])}, are at times "
-        "at which the trajectory repeats the same pose: did it freeze?"
-    ]
+def _find_standstill_and_gaps(trajectory: Trajectory, times_s: np.ndarray) -> Iterator[str]:
+    """Yield warnings about images between equal poses, and in gaps in which the trajectory moves."""
+    poses, steps = trajectory.poses, np.diff(trajectory.times_s)
+    before = np.clip(np.searchsorted(trajectory.times_s, times_s, side="right") - 1, 0, len(steps) - 1)
+    frozen = times_s[(poses[1:] == poses[:-1]).all(axis=(1, 2))[before]]
+    if len(frozen) > 1:
+        yield (
+            f"{len(frozen)} of {len(times_s)} images, from {format_time(frozen[0])} to {format_time(frozen[-1])}, are "
+            "at times at which the trajectory repeats the same pose: did it freeze?"
+        )
+    moves = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    gaps = (steps > _LONGEST_STEP * np.median(steps)) & (moves > np.median(moves))
+    if gaps[before].any():
+        yield (
+            f"{np.count_nonzero(gaps[before])} of {len(times_s)} images are in gaps of the trajectory of up to "
+            f"{steps[gaps].max():.3g} s, whose poses are {np.median(steps):.3g} s apart otherwise"
+        )
 
 
-def _find_opposite_turn(trajectory: Trajectory) -> list[str]:
-    """Return a warning if the platform turns about the base's z axis as much as its course, in the other sense."""
+def _find_opposite_turn(trajectory: Trajectory) -> Iterator[str]:
+    """Yield a warning if the platform turns about the base's z axis as much as its course, in the other sense."""
     way = np.append(0, np.cumsum(np.linalg.norm(np.diff(trajectory.poses[:, :2, 3], axis=0), axis=1)))
     stops = np.searchsorted(way, np.linspace(0, way[-1], _STOPS))
     if len(np.unique(stops)) < _STOPS:
-        return []
+        return
     moves = np.diff(trajectory.poses[stops, :2, 3], axis=0)
     course = float(np.diff(np.unwrap(np.arctan2(moves[:, 1], moves[:, 0]))[[0, -1]])[0])
     turns = Rotation.from_matrix(trajectory.poses[stops, :3, :3])
     # From the middle of the first move to that of the last.
     about_z = (turns[1:] * turns[:-1].inv()).as_rotvec()[:, 2]
     turned = float(about_z.sum() - (about_z[0] + about_z[-1]) / 2)
-    if abs(course) < _LEAST_TURN or abs(course + turned) > _LIKE * abs(course):
-        return []
-    return [
-        f"the course turns by {np.degrees(course):+.0f} deg about z, the platform by {np.degrees(turned):+.0f} deg: is "
-        "yaw a compass angle, or the frame mirrored?"
-    ]
-
-
-def _find_gap(trajectory: Trajectory, times_s: np.ndarray) -> list[str]:
-    """Return a warning about images in a gap of the trajectory in which it moves."""
-    steps = np.diff(trajectory.times_s)
-    moves = np.linalg.norm(np.diff(trajectory.poses[:, :3, 3], axis=0), axis=1)
-    gaps = (steps > _LONGEST_STEP * np.median(steps)) & (moves > np.median(moves))
-    within = gaps[np.clip(np.searchsorted(trajectory.times_s, times_s, side="right") - 1, 0, len(steps) - 1)]
-    if not within.any():
-        return []
-    return [
-        f"{np.count_nonzero(within)} of {len(times_s)} images are in gaps of the trajectory of up to "
-        f"{steps[gaps].max():.3g} s, whose poses are {np.median(steps):.3g} s apart otherwise"
-    ]
+    if abs(course) >= _LEAST_TURN and abs(course + turned) <= _LIKE * abs(course):
+        yield (
+            f"the course turns by {np.degrees(course):+.0f} deg about z, the platform by {np.degrees(turned):+.0f} "
+            "deg: is yaw a compass angle, or the frame mirrored?"
+        )

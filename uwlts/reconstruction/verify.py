@@ -8,23 +8,13 @@ import numpy as np
 
 from uwlts.argument_types import check_arguments
 from uwlts.errors import EvaluationError, RangeError
-from uwlts.evaluation.artefact_figures import evaluate_cloud
-from uwlts.evaluation.evaluate import ArtefactFigures
-from uwlts.evaluation.figure_uncertainty import figure_uncertainties
+from uwlts.evaluation.evaluate import evaluate
 from uwlts.model.artefacts import parse_artefact
 from uwlts.model.calibration import AnyCalibration, calibration_digest
 from uwlts.model.sensor import Vector
 from uwlts.reconstruction.reconstruct import reconstruct
 from uwlts.storage.calibration_file import VerificationRecord, resolve_calibration, write_verification
 from uwlts.storage.capture import Capture, open_capture
-
-
-def normalise_error(error: float, measured: float | None, calibrated: float | None) -> float | None:
-    """Return E_n of ISO/IEC 17043 from the expanded uncertainties of both values; None if the measured one is unknown.
-
-    An unknown uncertainty of the calibrated value counts as zero.
-    """
-    return None if measured is None else abs(error) / float(np.hypot(measured, calibrated or 0.0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +45,7 @@ class Verdict:
     @property
     def normalised_error(self) -> float | None:
         """E_n of ISO/IEC 17043, error divided by expanded uncertainty; None if that of the measurement is unknown."""
-        return normalise_error(self.error_mm, self.measured_expanded_mm, self.calibrated_expanded_mm)
+        return None if self.measured_expanded_mm is None else abs(self.error_mm) / self.expanded_mm
 
     @property
     def passed(self) -> bool:
@@ -154,28 +144,29 @@ def verify(
         artefact = parse_artefact(scan.header.artefact)
         cloud = reconstruct(scan, calibration)
         not_shown = find_undetectable_errors(artefact.kind, scan.stage_mm, scan.header.stage_direction)
-    evaluation = evaluate_cloud(cloud, artefact)
-    counts = ArtefactFigures.model_validate(evaluation.as_dict())
+    found = evaluate(cloud, artefact)
+    counts = found.evaluation
+    assert counts is not None
     if doubts := counts.doubts():
         raise EvaluationError(f"nothing is verified: {doubts[0]}")
-    known = figure_uncertainties(cloud, evaluation)
     verdicts = tuple(
         Verdict(
             quantity=calibrated.name,
             calibrated_mm=calibrated.value_mm,
             measured_mm=figure.measured_mm,
             calibrated_expanded_mm=calibrated.uncertainty_mm,
-            measured_expanded_mm=known[figure.key.name].expanded_mm if figure.key.name in known else None,
+            measured_expanded_mm=figure.expanded_uncertainty_mm,
             limit_mm=limit_mm,
         )
-        for figure in evaluation.figures
+        for figure in found.figures
         if (calibrated := figure.key.calibrated) is not None and not figure.key.is_detail
     )
     if not verdicts:
         raise EvaluationError(f"the artefact '{artefact.kind}' has no calibrated size; add one to its description")
+    outliers = counts.points_rejected / (counts.points_used + counts.points_rejected)
     share = (
         f"{100 * counts.strange_share:.1f} % of the points do not belong to the artefact; "
-        f"{100 * evaluation.rejected_share:.1f} % of its own are outliers (VDI/VDE 2634 allows 0.3 %)"
+        f"{100 * outliers:.1f} % of its own are outliers (VDI/VDE 2634 allows 0.3 %)"
     )
     return Verification(verdicts, (share, *not_shown), scan.path.name, calibration_digest(calibration))
 

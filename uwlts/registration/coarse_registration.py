@@ -77,8 +77,12 @@ def _match_pair(
         return found[0], 1e6 * found[1]
     for voxel, *gains in _TRIES:
         movement = _match_features(points_a, points_b, voxel * a.radius_mm, *gains)
-        if movement is not None and (found := _refine_transform(a, b, movement))[1] >= _LEAST_OVERLAP:
-            return found
+        # The transform is refined by the joint estimate of this pair, unless the overlap leaves a direction open.
+        if movement is None or (fitted := fit_pair(a, b, movement)) is None:
+            continue
+        fits = np.abs(fitted[1].distance_mm) < _CLOSE * fitted[1].std_mm
+        if np.count_nonzero(fits) >= _LEAST_OVERLAP and np.mean(fits) > _LEAST_SHARE:
+            return fitted[0], float(np.count_nonzero(fits))
     return None
 
 
@@ -104,15 +108,3 @@ def _match_features(
         return None
     result = rigid_transform(np.asarray(found.rotation), np.asarray(found.translation) * voxel / _VOXEL_UNITS)
     return result if np.isfinite(result).all() else None
-
-
-def _refine_transform(a: Patches, b: Patches, movement: np.ndarray) -> tuple[np.ndarray, float]:
-    """Refine a transform by the joint estimate of this pair; return it with the number of coinciding patches.
-
-    The number is 0 if many patches disagree or if the overlap leaves a direction undetermined.
-    """
-    if (fitted := fit_pair(a, b, movement)) is None:
-        return movement, 0.0
-    found = fitted[1]
-    fits = np.abs(found.distance_mm) < _CLOSE * found.std_mm
-    return fitted[0], float(np.count_nonzero(fits)) if len(fits) and np.mean(fits) > _LEAST_SHARE else 0.0

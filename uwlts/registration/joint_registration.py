@@ -65,9 +65,12 @@ class PairEvidence:
     ways: tuple[tuple[int, int, PatchDistances], ...]
     """Source, target and distances in both directions, in the order of the rows."""
     places_mm: np.ndarray  # (patches, 3); positions of the surface distances
-    # Numbers of surface distances and of common spheres.
-    patches: int
-    spheres: int
+    patches: int  # number of surface distances
+
+    @property
+    def spheres(self) -> int:
+        """Number of common spheres."""
+        return (len(self.residuals) - self.patches) // 3
 
     def normal(self) -> np.ndarray:
         """Return the normal matrix (U, U)."""
@@ -315,8 +318,7 @@ class JointRegistration:
         relative = np.concatenate([each.distance_mm / each.std_mm for *_, each in ways]) if ways else np.empty(0)
         stated = self.patches[a].noise_stated and self.patches[b].noise_stated
         spread = max(robust_std(relative) if ways else 1.0, 1.0 if stated else _LEAST_SPREAD)
-        blocks, residuals, weights, deviations = [], [], [], []
-        spurious = np.zeros((self.unknown_poses, self.unknown_poses))
+        rows, spurious = [], np.zeros((self.unknown_poses, self.unknown_poses))
         for source, target, found in ways:
             std = found.std_mm * spread
             # Each pair is measured in both directions. K scans of one place form K (K - 1) / 2 pairs, but only K - 1
@@ -327,18 +329,15 @@ class JointRegistration:
             block = np.zeros((len(weight), unknown))
             block[:, : self.unknown_poses] = by_poses(found.normals)
             own, other = (
-                self.patches[n].patterns_mm[:, rows].transpose(1, 0, 2)
-                for n, rows in ((source, found.source), (target, found.target))
+                self.patches[n].patterns_mm[:, chosen].transpose(1, 0, 2)
+                for n, chosen in ((source, found.source), (target, found.target))
             )
             if found.target_patterns_mm is not None:
                 other = found.target_patterns_mm
             for number, shifts, sign in ((source, own, 1.0), (target, other, -1.0)):
                 turned = shifts @ self.poses[number, :3, :3].T
                 block[:, self.pattern_columns[number]] = sign * np.einsum("qmi,qi->qm", turned, found.normals)
-            blocks.append(block)
-            residuals.append(found.distance_mm)
-            weights.append(weight)
-            deviations.append(found.std_mm)
+            rows.append((block, found.distance_mm, weight, found.std_mm))
             # A scatter above the noise may come from a deformation, which does not turn the normals.
             spurious += slope_information(
                 found.normals, weight * min(spread, 1.0) ** 2 * found.slope_variance, by_poses
@@ -352,23 +351,12 @@ class JointRegistration:
                 if len(columns := self.pose_columns[number]):
                     block[:, columns] = sign * rigid_derivatives(marker.centre_mm, root, middles[number])
                 block[:, self.pattern_columns[number]] = sign * root @ marker.patterns_mm.T
-            blocks.append(block)
-            residuals.append(off)
             # Spheres are scaled by the same spread as surfaces, since they would otherwise dominate a poor fit.
-            weights.append(np.full(3, 2 / views / max(spread, 1.0) ** 2))
-            deviations.append(np.ones(3))
-        return PairEvidence(
-            np.vstack(blocks),
-            np.concatenate(residuals),
-            np.concatenate(weights),
-            np.concatenate(deviations),
-            spread,
-            spurious,
-            tuple(ways),
-            np.vstack([found.places_mm for *_, found in ways]) if ways else np.empty((0, 3)),
-            len(relative),
-            len(spheres),
-        )
+            rows.append((block, off, np.full(3, 2 / views / max(spread, 1.0) ** 2), np.ones(3)))
+        derivatives, residuals, weights, std = (np.concatenate(each) for each in zip(*rows, strict=True))
+        places = np.concatenate([np.empty((0, 3)), *(found.places_mm for *_, found in ways)])
+        known = derivatives, residuals, weights, std, spread, spurious
+        return PairEvidence(*known, tuple(ways), places, len(relative))
 
     def _derivatives_by_poses(self, source: int, target: int, places: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Return the derivatives (Q, P), by all poses, of distances between two scans along directions (Q, 3)."""

@@ -50,7 +50,11 @@ def group_markers(scans: Sequence[Sequence[MarkerSphere]], reach_mm: float) -> l
     groups: list[dict[int, MarkerSphere]] = []
     for number, markers in enumerate(scans):
         for marker in markers:
-            away = [np.inf if number in group else _distance_from_mean(marker, group) for group in groups]
+            means = [np.mean([each.centre_mm for each in group.values()], axis=0) for group in groups]
+            away = [
+                np.inf if number in group else np.linalg.norm(mean - marker.centre_mm)
+                for group, mean in zip(groups, means, strict=True)
+            ]
             if away and min(away) < reach_mm:
                 groups[int(np.argmin(away))][number] = marker
             else:
@@ -84,7 +88,3 @@ def match_markers(
                 if best is None or np.count_nonzero(fits) > best[1]:
                     best = fit_rigid_transform(a[fits], b[off.argmin(axis=1)[fits]]), int(np.count_nonzero(fits))
     return best if best is not None and best[1] >= 3 else None
-
-
-def _distance_from_mean(marker: MarkerSphere, group: dict[int, MarkerSphere]) -> float:
-    return float(np.linalg.norm(np.mean([each.centre_mm for each in group.values()], axis=0) - marker.centre_mm))

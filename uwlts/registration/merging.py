@@ -21,29 +21,28 @@ def merge_clouds(
     ``covariance`` (U, U) is that of all unknowns of the estimate. A scan without uncertainty receives that of its pose
     alone.
     """
-    points, random, position, frames, firsts = [], [], [], [], []
-    first = 0
+    rows, firsts, first = [], [], 0
     for number, scan in enumerate(scans):
-        rotation = joint.poses[number, :3, :3]
-        points.append(_correct_points(scan, joint.patterns[number]) @ rotation.T + joint.poses[number, :3, 3])
-        known = scan.uncertainty
-        random.append(np.zeros((len(scan), 6)) if known is None else rotate_covariances(known.random_mm2, rotation))
-        position.append(np.zeros((len(scan), 3)) if known is None else known.position_mm @ rotation.T)
-        frames.append(np.where(scan.frame == NO_INDEX, NO_INDEX, scan.frame + first))
+        rotation, known = joint.poses[number, :3, :3], scan.uncertainty
+        places, random, position = scan.points_mm, np.zeros((len(scan), 6)), np.zeros((len(scan), 3))
+        if known is not None:
+            places = places + np.tensordot(joint.patterns[number], known.patterns_mm, axes=1)
+            random, position = rotate_covariances(known.random_mm2, rotation), known.position_mm @ rotation.T
+        frame = np.where(scan.frame == NO_INDEX, NO_INDEX, scan.frame + first)
+        moved = places @ rotation.T + joint.poses[number, :3, 3]
+        rows.append((moved, random, position, frame, scan.intensity, scan.line))
         firsts.append(first)
         first += int(scan.frame.max(initial=-1)) + 1
+    points, random, position, frame, intensity, line = (np.concatenate(each) for each in zip(*rows, strict=True))
+    patterns = _joint_patterns(scans, [moved for moved, *_ in rows], joint, covariance)
+    parts = random.astype(np.float32), position.astype(np.float32), patterns, _rotate_image_poses(scans, joint)
     times = [scan.time_s for scan in scans if scan.time_s is not None]
     return PointCloud(
-        points_mm=np.vstack(points),
-        intensity=np.concatenate([scan.intensity for scan in scans]),
-        frame=np.concatenate(frames),
-        line=np.concatenate([scan.line for scan in scans]),
-        uncertainty=PointUncertainty(
-            np.vstack(random).astype(np.float32),
-            np.vstack(position).astype(np.float32),
-            _joint_patterns(scans, points, joint, covariance),
-            _rotate_image_poses(scans, joint),
-        ),
+        points_mm=points,
+        intensity=intensity,
+        frame=frame,
+        line=line,
+        uncertainty=PointUncertainty(*parts),
         time_s=np.concatenate(times) if len(times) == len(scans) else None,
         metadata=_merge_metadata(scans, names, joint, firsts),
     )
@@ -60,12 +59,6 @@ def _rotate_image_poses(scans: Sequence[PointCloud], joint: JointRegistration) -
         if each is not None:
             parts[number][: len(each)] = each @ joint.poses[number, :3, :3].T
     return np.concatenate(parts, axis=1)
-
-
-def _correct_points(scan: PointCloud, amounts: np.ndarray) -> np.ndarray:
-    if scan.uncertainty is None or not len(amounts):
-        return scan.points_mm
-    return scan.points_mm + np.tensordot(amounts, scan.uncertainty.patterns_mm, axes=1)
 
 
 def _joint_patterns(

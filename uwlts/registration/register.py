@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -165,19 +165,7 @@ class RegisteredScans(Brief):
             "open_movements": [
                 {"scan": self.names[each.scan], "movement": each.describe()} for each in self.open_movements
             ],
-            "pairs": [
-                {
-                    "scans": [self.names[number] for number in pair.scans],
-                    "patches": pair.patches,
-                    "mean_mm": pair.mean_mm,
-                    "rms_mm": pair.rms_mm,
-                    "scatter": pair.scatter,
-                    "closure_mm": pair.closure_mm,
-                    "spheres": pair.spheres,
-                    "sphere_rms": pair.sphere_rms,
-                }
-                for pair in self.pairs
-            ],
+            "pairs": [asdict(pair) | {"scans": [self.names[number] for number in pair.scans]} for pair in self.pairs],
             "narrow_overlaps": [
                 {"scans": [self.names[first], self.names[second]], "patches": patches}
                 for first, second, patches in self.narrow_overlaps
@@ -311,7 +299,8 @@ def register(
     std = None if start_std_mm is None or start_std_deg is None else (start_std_mm, float(np.radians(start_std_deg)))
     shared = [{} if scan.uncertainty is None else scan.uncertainty.shared for scan in scans]
     joint = JointRegistration(patches, markers, start, start_std=std, sphere_mm=sphere_mm, shared=shared)
-    reach = 0.0 if search else reach_mm or _REACH * float(np.median([_size(scan) for scan in scans]))
+    sizes = [np.linalg.norm(np.ptp(scan.points_mm, axis=0)) for scan in scans]
+    reach = 0.0 if search else reach_mm or _REACH * float(np.median(sizes))
     reach = approach(joint, reach, names, lambda done: progress(len(scans) + done, steps))
     progress(steps, steps)
     distances, pairs, solution, known = settle(joint, reach, names)
@@ -434,7 +423,3 @@ def _checked_poses(poses: np.ndarray | None, count: int) -> np.ndarray:
     if not is_rigid(start, within=_ROUNDED):
         raise EvaluationError("an initial pose is not a rigid transform; expected a rotation and a last row of 0 0 0 1")
     return np.linalg.inv(start[0]) @ start
-
-
-def _size(cloud: PointCloud) -> float:
-    return float(np.linalg.norm(np.ptp(cloud.points_mm, axis=0)))

@@ -6,7 +6,7 @@ motion are absorbed by the registration, so their effect on the estimated motion
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,23 +25,23 @@ _KNOWN = 1e12  # prior information on the amplitudes of systematic patterns: the
 
 
 @dataclass(frozen=True, eq=False)
-class Nearest:
-    """Signed distances (N,) of points from a shape along unit normals (N, 3); NaN beyond the search distance."""
-
-    distance_mm: np.ndarray
-    normals: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
 class SurfaceSample:
-    """Points (N, 3) of a surface, and for a cloud their uncertainty and images (N,)."""
+    """Points (N, 3) of a cloud with their uncertainty and images (N,), or samples of a mesh with normals (N, 3)."""
 
     points_mm: np.ndarray
     uncertainty: PointUncertainty | None = None
     frame: np.ndarray | None = None
+    normals: np.ndarray | None = None
+    rounding_std_mm: float = 0.0  # by the steps of a cloud's stored coordinates
+    warnings: tuple[str, ...] = ()
 
-    def select(self, chosen: np.ndarray) -> SurfaceSample:
-        """Return some of the points, by indices or a mask."""
+    @property
+    def meshed(self) -> bool:
+        """True for samples of a mesh, which are free of noise."""
+        return self.normals is not None
+
+    def select(self, chosen: np.ndarray | slice) -> SurfaceSample:
+        """Return some of the points."""
         known, frame = self.uncertainty, self.frame
         return SurfaceSample(
             self.points_mm[chosen], None if known is None else known[chosen], None if frame is None else frame[chosen]
@@ -77,6 +77,14 @@ class Registration:
         moved = step[:3] + np.cross(step[3:6], points_mm - self.middle_mm)
         return moved if normals is None or len(step) == 6 else moved + step[6] * normals
 
+    def follow(
+        self, known: PointUncertainty, steps: np.ndarray, points_mm: np.ndarray, normals: np.ndarray | None = None
+    ) -> PointUncertainty:
+        """Return an uncertainty of points (N, 3) whose patterns contain a step of the motion for each (M, 6)."""
+        moves = [self.moves_mm(step, points_mm, normals) for step in steps]
+        patterns = known.patterns_mm + np.array(moves, np.float32).reshape(known.patterns_mm.shape)
+        return replace(known, patterns_mm=patterns.astype(np.float32))
+
 
 def register_to_surface(
     cloud: SurfaceSample, reference: SurfaceSample, *, reach_mm: float, datums: np.ndarray | None = None
@@ -105,12 +113,14 @@ def register_to_surface(
     _, pairs, solution, covariance = settle(joint, approach(joint, reach_mm, names), names)
     (pair,) = pairs.values()
     of_reference, of_cloud = (-solution.response[:6, :6] @ pair.normal()[:6, each] for each in joint.pattern_columns)
-    left = pair.residuals[pair.counted]
+    left, ways = pair.residuals[pair.counted], solution.open_directions / joint.units[:6]
+    # Open motions are named by their large components.
+    large = (np.flatnonzero(np.abs(way) > 0.3 * np.abs(way).max()) for way in ways)
     return Registration(
         joint.poses[1],
         covariance[:6, :6],
         joint.middles_mm[1],
-        tuple(map(_name_motion, solution.open_directions / joint.units[:6])),
+        tuple(" with ".join(_NAMES[k] for k in each) for each in large),
         float(np.sqrt(np.mean(left**2))),
         len(left),
         of_cloud.T,
@@ -119,26 +129,26 @@ def register_to_surface(
 
 
 def shape_registration(
-    points_mm: np.ndarray, near: Nearest, *, sized: bool, uncertainty: PointUncertainty | None, frame: np.ndarray | None
+    cloud: SurfaceSample, distance_mm: np.ndarray, normals: np.ndarray, *, sized: bool
 ) -> Registration:
     """Return the uncertainty of a shape that was fitted to points by least squares, as a zero registration.
 
-    ``near`` are the distances of the points (N, 3) from the shape, and its normals; ``sized``: the radius was fitted,
-    too. The uncertainty of the points may be unknown (None).
+    The points have distances (N,) from the shape along its normals (N, 3). ``sized``: the radius was fitted, too.
     """
+    points_mm, uncertainty = cloud.points_mm, cloud.uncertainty
     middle = points_mm.mean(axis=0)
-    by = _motion_derivatives(points_mm, near.normals, middle, sized=sized)
+    by = _motion_derivatives(points_mm, normals, middle, sized=sized)
     # Rotations are scaled by the rms radius, so that all unknowns are lengths.
     units = np.array([1.0] * 3 + [1 / max(rms_distance(points_mm, middle), 1e-9)] * 3 + [1.0] * sized)
     values, vectors = np.linalg.eigh((by * units).T @ (by * units))
     known = values > _LEAST * values[-1]
     answer = -units[:, None] * (vectors[:, known] / values[known]) @ vectors[:, known].T @ (by * units).T
-    covariance, patterns = np.mean(near.distance_mm**2) * answer @ answer.T, np.empty((0, len(answer)))
+    covariance, patterns = np.mean(distance_mm**2) * answer @ answer.T, np.empty((0, len(answer)))
     if uncertainty is not None:
-        images = np.arange(len(points_mm)) if frame is None else frame
-        covariance = covariance + grouped_covariance(answer, project_image_errors(uncertainty, near.normals), images)
-        patterns = np.einsum("mni,ni->mn", uncertainty.patterns_mm, near.normals) @ answer.T
-    rms = float(np.sqrt(np.mean(near.distance_mm**2)))
+        images = np.arange(len(points_mm)) if cloud.frame is None else cloud.frame
+        covariance = covariance + grouped_covariance(answer, project_image_errors(uncertainty, normals), images)
+        patterns = np.einsum("mni,ni->mn", uncertainty.patterns_mm, normals) @ answer.T
+    rms = float(np.sqrt(np.mean(distance_mm**2)))
     none = np.empty((0, len(answer)))
     return Registration(np.eye(4), covariance, middle, (), rms, len(points_mm), patterns, none)
 
@@ -152,15 +162,7 @@ def select_within(points: np.ndarray, datums: np.ndarray) -> np.ndarray:
     return np.any(np.linalg.norm(points[:, None] - datums[:, :3], axis=2) <= datums[:, 3], axis=1)
 
 
-def _motion_derivatives(
-    points: np.ndarray, normals: np.ndarray, middle: np.ndarray, *, sized: bool = False
-) -> np.ndarray:
+def _motion_derivatives(points: np.ndarray, normals: np.ndarray, middle: np.ndarray, *, sized: bool) -> np.ndarray:
     """Return the derivatives (N, 6) of distances by translation and rotation, or (N, 7) with the radius."""
     by = rigid_derivatives(points, normals, middle)
     return np.hstack([by, np.ones((len(by), 1))]) if sized else by
-
-
-def _name_motion(direction: np.ndarray) -> str:
-    """Name the large components of a motion."""
-    large = np.flatnonzero(np.abs(direction) > 0.3 * np.abs(direction).max())
-    return " with ".join(_NAMES[k] for k in large)

@@ -144,7 +144,10 @@ def _cylinder_starts(points: np.ndarray, known: float | None, axis_start: Any) -
         step = np.arange(_DIRECTIONS) + 0.5
         z, angle = step / _DIRECTIONS, np.pi * (3.0 - 5.0**0.5) * step
         lattice = np.sqrt(1.0 - z**2) * np.array([np.cos(angle), np.sin(angle)])
-        directions = np.vstack([principal_axes(points)[1], _normal_to_normals(points), np.vstack([lattice, z]).T])
+        normals = local_normals(points)
+        # The direction most nearly normal to the surface's normals.
+        along = np.linalg.eigh(normals.T @ normals)[1][:, 0]
+        directions = np.vstack([principal_axes(points)[1], along, np.vstack([lattice, z]).T])
     else:
         directions = np.asarray(axis_start, dtype=np.float64).reshape(1, 3)
         if not np.isfinite(directions).all() or not directions.any():
@@ -163,10 +166,8 @@ def _cylinder_starts(points: np.ndarray, known: float | None, axis_start: Any) -
     return starts
 
 
-def _normal_to_normals(points: np.ndarray) -> np.ndarray:
-    """Return the direction most nearly normal to the surface normals of small neighbourhoods."""
+def local_normals(points: np.ndarray) -> np.ndarray:
+    """Return the surface normals (N, 3) of small neighbourhoods of points, with any sign."""
     _, nearest = KDTree(points).query(points, k=min(_NEIGHBOURS, len(points)))
     patches = points[nearest] - points[nearest].mean(axis=1, keepdims=True)
-    _, vectors = np.linalg.eigh(np.swapaxes(patches, 1, 2) @ patches)
-    normals = vectors[:, :, 0]
-    return np.linalg.eigh(normals.T @ normals)[1][:, 0]
+    return np.linalg.eigh(np.swapaxes(patches, 1, 2) @ patches)[1][:, :, 0]

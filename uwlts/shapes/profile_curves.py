@@ -8,7 +8,7 @@ import numpy as np
 
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import robust_std
-from uwlts.shapes.flat import Circle
+from uwlts.shapes.flat import Circle, Line
 
 LEAST_POINTS = 12  # points on the artefact that a profile needs: four for each of a circle's three parameters
 _TRIALS = 400
@@ -166,11 +166,9 @@ def _refit_inliers(
 
 
 def _refine_arc(points: np.ndarray, members: np.ndarray, tolerance: float) -> ProfileArc | None:
-    def off(some: np.ndarray) -> np.ndarray:
-        return Circle.fit(points[some]).distances_mm(points)
-
     try:
-        if (found := _refit_inliers(members, tolerance, off)) is None:
+        found = _refit_inliers(members, tolerance, lambda some: Circle.fit(points[some]).distances_mm(points))
+        if found is None:
             return None
         members, std = found
         circle = Circle.fit(points[members])
@@ -206,16 +204,8 @@ def find_line(points: np.ndarray, rng: np.random.Generator) -> ProfileLine | Non
     tolerance = _choose_tolerance(off, float(np.linalg.norm(np.ptp(points, axis=0))))
     members = off[np.argmax(np.count_nonzero(off < tolerance, axis=1))] < tolerance
 
-    def line(some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        middle = points[some].mean(axis=0)
-        return middle, np.linalg.svd(points[some] - middle, full_matrices=False)[2][0]
-
-    def measure_distances(some: np.ndarray) -> np.ndarray:
-        middle, direction = line(some)
-        return (points - middle) @ np.array([-direction[1], direction[0]])
-
-    if (found := _refit_inliers(members, tolerance, measure_distances)) is None:
+    if (found := _refit_inliers(members, tolerance, lambda some: Line.fit(points[some]).distances_mm(points))) is None:
         return None
     members, std = found
-    middle, direction = line(members)
-    return ProfileLine(members=members, std_mm=std, middle_mm=middle, direction=direction)
+    line = Line.fit(points[members])
+    return ProfileLine(members=members, std_mm=std, middle_mm=line.point_mm, direction=line.direction)

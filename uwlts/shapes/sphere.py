@@ -64,8 +64,7 @@ class Sphere:
 
         The derivative of |p - c| - r is minus the unit vector from the centre, and -1 for a free radius.
         """
-        by_radius = np.full((len(points), len(self.covariance) - 3), -1.0)
-        return np.hstack([-self.normals_at(points), by_radius])
+        return _derivatives(points, self.centre_mm, free=len(self.covariance) - 3)
 
     @classmethod
     def fit(cls, points: Any, radius_mm: float | None = None) -> Self:
@@ -75,17 +74,13 @@ class Sphere:
         plane. The same if the standard uncertainty of the centre exceeds a fifth of the radius.
         """
         unit, known = prepare_round(points, radius_mm, least=5, what="a sphere fit")
-
-        def jacobian(x: np.ndarray) -> np.ndarray:
-            """Return d|p - c| / dc, minus the unit vector from the centre, and -1 for the radius."""
-            return np.hstack([-unit_vectors(unit.points - x[:3]), np.full((len(unit.points), len(x) - 3), -1.0)])
-
         parameters, cost = minimise_squares(
             lambda x: np.linalg.norm(unit.points - x[:3], axis=1) - (x[3] if known is None else known),
-            jacobian,
+            lambda x: _derivatives(unit.points, x[:3], free=len(x) - 3),
             np.hstack(fit_algebraic_centres(unit.points)) if known is None else initial_centre(unit.points, known),
         )
-        covariance, std = parameter_covariance(jacobian(parameters), cost, what="a sphere")
+        jacobian = _derivatives(unit.points, parameters[:3], free=len(parameters) - 3)
+        covariance, std = parameter_covariance(jacobian, cost, what="a sphere")
         centre = unit.centroid_mm + unit.scale_mm * parameters[:3]
         radius = float(radius_mm if radius_mm is not None else parameters[3] * unit.scale_mm)
         uncertainty = float(np.sqrt(np.trace(covariance[:3, :3]))) * unit.scale_mm
@@ -126,6 +121,10 @@ class Sphere:
                 return found
             usable &= np.abs(np.linalg.norm(points - centre, axis=1) - radius_mm) > _SEARCH_LIMIT * radius_mm
         return None
+
+
+def _derivatives(points: np.ndarray, centre: np.ndarray, *, free: int) -> np.ndarray:
+    return np.hstack([-unit_vectors(points - centre), np.full((len(points), free), -1.0)])
 
 
 @dataclass(frozen=True, eq=False)

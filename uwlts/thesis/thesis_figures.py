@@ -1,16 +1,17 @@
 """Figures of G. S. de Matos's thesis (UFSC 2017) that follow from several captures: Tables 4 and 9, and Figure 67."""
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
 
 from uwlts.calibration.capture_evidence import step_evidence
 from uwlts.calibration.sequential.step_images import StepImage, label_step, solve_window
-from uwlts.errors import CalibrationError, RangeError
+from uwlts.errors import CalibrationError
 from uwlts.evaluation.artefact_figures import evaluate_spheres
 from uwlts.model.artefacts import SphereStandard
 from uwlts.model.calibration import AnyCalibration, Calibration, WindowModel
@@ -28,70 +29,34 @@ from uwlts.stripe import find_stripes
 UNIFORM = 1 / math.sqrt(3)  # standard deviation of a uniform distribution divided by its half-width (GUM 4.3.7)
 
 
-@dataclass(frozen=True, kw_only=True)
-class UncertaintySource:
-    """Source of uncertainty, in the unit of the result.
+class UncertaintySource(NamedTuple):
+    """Standard uncertainty, its degrees of freedom (infinite if exactly known), and a correction to be added."""
 
-    ``standard_uncertainty`` is at least 0, ``degrees_of_freedom`` at least 1, infinite if exactly known. ``correction``
-    is to be added to the result.
-    """
-
-    name: str
-    standard_uncertainty: float
+    std: float
     degrees_of_freedom: float = math.inf
     correction: float = 0.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class Budget:
-    """Combined uncertainty u_c of all sources (GUM Eq. 10), in the unit of the result.
+def combine(sources: Sequence[UncertaintySource], *, coverage_probability: float = 0.95) -> dict[str, float]:
+    """Combine uncorrelated sources (GUM Eq. 10) to the figures of their budget, in the unit of the sources.
 
-    ``shares_percent`` are each source's contributions to u_c squared. ``degrees_of_freedom`` are effective, from the
-    Welch-Satterthwaite formula (GUM G.4.1, Eq. G.2b), not rounded. ``coverage_factor`` k is Student's t for them,
-    truncated to an integer (GUM G.4.1, note 1); ``expanded_uncertainty`` is k u_c. ``correction`` is the sum of the
-    sources' corrections. ``largest_error`` applies to an uncorrected result: its absolute correction plus U (thesis
-    section 4.8.5; the GUM would correct).
-    """
-
-    sources: tuple[UncertaintySource, ...]
-    standard_uncertainty: float
-    shares_percent: tuple[float, ...]
-    degrees_of_freedom: float
-    coverage_factor: float
-    expanded_uncertainty: float
-    correction: float
-    largest_error: float
-
-
-def combine(sources: Iterable[UncertaintySource], *, coverage_probability: float = 0.95) -> Budget:
-    """Combine uncorrelated sources.
+    ``degrees_of_freedom`` are effective, from the Welch-Satterthwaite formula (GUM G.4.1, Eq. G.2b), not rounded.
+    ``expanded`` is the combined uncertainty times Student's t for them, truncated to an integer (note 1).
+    ``correction`` is the sum of the sources' corrections. ``largest_error`` applies to an uncorrected result: its
+    absolute correction plus the expanded uncertainty (thesis section 4.8.5; the GUM would correct).
 
     The thesis's U of 0.37 mm (Table 9) has a coverage of 95.45 %, the probability of two normal standard deviations; 95
     % gives 0.36.
-
-    Raises RangeError if no source has an uncertainty.
     """
-    sources = tuple(sources)
-    parts = [source.standard_uncertainty for source in sources]
-    total = math.hypot(*parts)
-    if not total > 0:
-        raise RangeError(f"none of {len(sources)} sources has an uncertainty; expected at least one")
-    spread = sum((part / total) ** 4 / s.degrees_of_freedom for part, s in zip(parts, sources, strict=True))
+    total = math.hypot(*(source.std for source in sources))
+    spread = sum((source.std / total) ** 4 / source.degrees_of_freedom for source in sources)
     freedom = 1 / spread if spread > 0 else math.inf
     # Rounding errors must not turn 5 degrees of freedom into 4.
     whole = math.floor(freedom * (1 + 1e-9)) if math.isfinite(freedom) else math.inf
-    factor = float(stats.t.ppf((1 + coverage_probability) / 2, whole))
+    expanded = float(stats.t.ppf((1 + coverage_probability) / 2, whole)) * total
     correction = sum(source.correction for source in sources)
-    return Budget(
-        sources=sources,
-        standard_uncertainty=total,
-        shares_percent=tuple(100 * (part / total) ** 2 for part in parts),
-        degrees_of_freedom=freedom,
-        coverage_factor=factor,
-        expanded_uncertainty=factor * total,
-        correction=correction,
-        largest_error=abs(correction) + factor * total,
-    )
+    figures = {"degrees_of_freedom": freedom, "expanded": expanded, "correction": correction}
+    return figures | {"largest_error": abs(correction) + expanded}
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,17 +89,14 @@ def sphere_scan(capture: Capture, calibration: AnyCalibration) -> SphereScan:
     stripes = find_stripes(capture)
     scan = reconstruct_stripes(capture, stripes, calibration)
     evaluation = evaluate_spheres(scan.points_mm, standard)
-    centres = np.array([sphere.centre_mm for sphere in evaluation.spheres])
-    radii = np.array(standard.diameters_mm) / 2
-    used = np.isfinite(evaluation.deviation_mm)
-    away = np.abs(np.linalg.norm(scan.points_mm[used, None] - centres, axis=2) - radii)
+    used = evaluation.labels >= 0
     lines = int(stripes.line.max()) + 1
     kept = np.flatnonzero(np.isin(lines * stripes.frame + stripes.line, (lines * scan.frame + scan.line)[used]))
     line, centre = stripes.line[kept], stripes.centre_px[kept]
     return SphereScan(
         pixels=stack_pixels(line, centre, stripe_along=capture.header.sensor.camera.stripe_along),
         stage_mm=capture.stage_mm[stripes.frame[kept]],
-        sphere=np.argmin(away, axis=1),
+        sphere=evaluation.labels[used],
         stage_direction=np.array(capture.header.stage_direction),
         medium_index=capture.header.medium.refractive_index(capture.header.sensor.laser.wavelength_nm),
         spacing_mm=standard.spacings_mm[0],
@@ -220,21 +182,12 @@ def spacing_budget(
         "resolution": _SUBPIXEL * mm_per_px(calibration, scans[0].medium_index) / 2,
     }
     scatter, correction = float(np.std(errors, ddof=1)), float(np.mean(np.abs(errors)))
-    certain = {name: UNIFORM * half for name, half in half_widths.items()} | {"standard": _STANDARD_EXPANDED_MM / 2}
-    freedom = {"degrees_of_freedom": len(errors) - 1, "correction": correction}
-    budget = combine(
-        [
-            *(UncertaintySource(name=name, standard_uncertainty=std) for name, std in certain.items()),
-            UncertaintySource(name="SSE", standard_uncertainty=scatter, **freedom),
-            UncertaintySource(name="PE", standard_uncertainty=deviation_mm),
-        ]
-    )
-    return {source.name: source.standard_uncertainty for source in budget.sources} | {
-        "degrees_of_freedom": budget.degrees_of_freedom,
-        "expanded": budget.expanded_uncertainty,
-        "correction": budget.correction,
-        "largest_error": budget.largest_error,
+    sources = {name: UncertaintySource(UNIFORM * half) for name, half in half_widths.items()} | {
+        "standard": UncertaintySource(_STANDARD_EXPANDED_MM / 2),
+        "SSE": UncertaintySource(scatter, len(errors) - 1, correction),
+        "PE": UncertaintySource(deviation_mm),
     }
+    return {name: source.std for name, source in sources.items()} | combine(list(sources.values()))
 
 
 def mm_per_px(calibration: Calibration, medium_index: float) -> float:

@@ -111,14 +111,25 @@ def test_a_loop_is_closed(loop, closed):
 
 
 @pytest.mark.slow
-def test_a_surface_that_fits_in_many_places_is_refused():
-    # Equal stones each 60 mm; the navigation is off by about 40 mm where the path crosses itself.
-    def ground(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        return 8 * np.cos(2 * np.pi * x / 60) * np.cos(2 * np.pi * y / 60)
-
-    drift = {"drift_mm": 60.0, "drift_deg": 0.3}
+@pytest.mark.parametrize(
+    ("ground", "drift_mm", "drift_deg", "message"),
+    [
+        # Equal stones each 60 mm; the navigation is off by about 40 mm where the path crosses itself.
+        (
+            lambda x, y: 8 * np.cos(2 * np.pi * x / 60) * np.cos(2 * np.pi * y / 60),
+            60.0,
+            0.3,
+            "fits in several positions",
+        ),
+        (lambda x, y: 0.02 * x - 0.01 * y, 60.0, 0.3, "no surfaces coincide within 3 standard deviations"),
+        (None, 1e-3, 1e-6, "do not determine a correction"),
+    ],
+    ids=["equal stones", "plane", "better navigation"],
+)
+def test_a_path_without_a_correction_is_refused(ground, drift_mm, drift_deg, message):
+    drift = {"drift_mm": drift_mm, "drift_deg": drift_deg}
     cloud, reported, _ = ride(np.random.default_rng(SEED), LOOP_MM, ground=ground, **drift)
-    with pytest.raises(uwlts.Error, match="fits in several positions"):
+    with pytest.raises(uwlts.Error, match=message):
         uwlts.align_trajectory(cloud, reported, **drift)
 
 
@@ -147,22 +158,6 @@ def test_a_random_walk_is_followed_within_a_crossing():
     # Errors along the path are correlated: few independent numbers of standard deviation one exceed 3 once in 300.
     off = (found.trajectory.poses - true.poses)[1:, :3, 3] / stated[1]
     assert np.sqrt(np.mean(off**2)) < 3
-
-
-@pytest.mark.slow
-def test_a_plane_sea_bed_is_refused():
-    drift = {"drift_mm": 60.0, "drift_deg": 0.3}
-    cloud, reported, _ = ride(np.random.default_rng(SEED), LOOP_MM, ground=lambda x, y: 0.02 * x - 0.01 * y, **drift)
-    with pytest.raises(uwlts.Error, match="no surfaces coincide within 3 standard deviations"):
-        uwlts.align_trajectory(cloud, reported, **drift)
-
-
-@pytest.mark.slow
-def test_a_navigation_that_is_better_than_the_surfaces_is_left_as_it_is():
-    drift = {"drift_mm": 1e-3, "drift_deg": 1e-6}
-    cloud, reported, _ = ride(np.random.default_rng(SEED), LOOP_MM, **drift)
-    with pytest.raises(uwlts.Error, match="do not determine a correction"):
-        uwlts.align_trajectory(cloud, reported, **drift)
 
 
 @pytest.mark.slow

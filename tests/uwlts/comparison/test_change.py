@@ -12,8 +12,14 @@ from scipy.spatial.transform import Rotation
 import uwlts
 from uwlts.cli import app
 from uwlts.comparison.change import SurfaceChange, _estimate_areas, _thin_points
-from uwlts.comparison.change_reference import read_reference, sample_mesh
-from uwlts.comparison.ideal_shapes import IdealCylinder, IdealPlane, IdealSphere, place_shape
+from uwlts.comparison.change_reference import (
+    IdealCylinder,
+    IdealPlane,
+    IdealSphere,
+    place_shape,
+    read_reference,
+    sample_mesh,
+)
 from uwlts.comparison.local_means import ComparisonOptions
 from uwlts.errors import CaptureError, DescriptionError, EvaluationError, OutputError
 from uwlts.fitting.local_surface import number_cubes
@@ -471,16 +477,18 @@ def test_regions_and_figures_are_those_of_the_places():
 def test_ideal_shapes_have_their_distances_and_normals():
     """Signed distances along unit normals; also in the centre of a sphere, where no normal is defined."""
     places = np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 2.0], [0.0, 0.0, 0.0]])
-    sphere = place_shape(IdealSphere(diameter_mm=6.0, point_mm=(0, 0, 0)), places).nearest(places)
-    np.testing.assert_allclose(sphere.distance_mm, [2.0, -1.0, -3.0])
-    np.testing.assert_allclose(sphere.normals, [[0.6, 0.8, 0], [0, 0, 1], [0, 0, 0]])
+    given = SurfaceSample(places)
+    distance, normals = place_shape(IdealSphere(diameter_mm=6.0, point_mm=(0, 0, 0)), given).nearest(places)
+    np.testing.assert_allclose(distance, [2.0, -1.0, -3.0])
+    np.testing.assert_allclose(normals, [[0.6, 0.8, 0], [0, 0, 1], [0, 0, 0]])
     pipe = IdealCylinder(diameter_mm=6.0, point_mm=(0, 0, 7), axis=(0, 0, -3))
-    found = place_shape(pipe, places).nearest(places, reach_mm=2.5)
-    np.testing.assert_allclose(found.distance_mm, [2.0, np.nan, np.nan])
-    np.testing.assert_allclose(found.normals[0], [0.6, 0.8, 0])
-    plane = place_shape(IdealPlane(point_mm=(0, 0, 1), normal=(0, 3, 4)), places).nearest(places)
-    np.testing.assert_allclose(plane.distance_mm, [2.4 - 0.8, 0.8, -0.8])
-    np.testing.assert_allclose(plane.normals, [[0, 0.6, 0.8]] * 3)
+    distance, normals = place_shape(pipe, given).nearest(places, reach_mm=2.5)
+    np.testing.assert_allclose(distance, [2.0, np.nan, np.nan])
+    np.testing.assert_allclose(normals[0], [0.6, 0.8, 0])
+    plane = IdealPlane(point_mm=(0, 0, 1), normal=(0, 3, 4))
+    distance, normals = place_shape(plane, given).nearest(places)
+    np.testing.assert_allclose(distance, [2.4 - 0.8, 0.8, -0.8])
+    np.testing.assert_allclose(normals, [[0, 0.6, 0.8]] * 3)
 
 
 def test_areas_of_places_add_up_to_the_surface():

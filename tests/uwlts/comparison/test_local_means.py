@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from uwlts.comparison.local_means import TWO_SIDED, _student_ratio, average_locally
+from uwlts.registration.surface_registration import SurfaceSample
 from uwlts.storage.cloud import PointUncertainty
 
 
@@ -15,7 +16,7 @@ def test_intervals_of_few_points_hold_as_often_as_stated() -> None:
     points = np.repeat(places, 5, axis=0) + np.column_stack([rng.uniform(-0.3, 0.3, (15000, 2)), np.zeros(15000)])
     points[:, 2] += rng.standard_normal(15000)
     normals = np.broadcast_to([0.0, 0.0, 1.0], places.shape)
-    found = average_locally(places, normals, points, uncertainty=None, frame=None, disc_mm=2.0, deep_mm=8.0)
+    found = average_locally(places, normals, SurfaceSample(points), disc_mm=2.0, deep_mm=8.0)
     inside = np.abs(found.mean_mm) < TWO_SIDED * np.sqrt(found.variance_mm2)
     assert abs(inside.mean() - 0.95) < 4.5 * np.sqrt(0.95 * 0.05 / 3000)
 
@@ -32,11 +33,11 @@ def test_means_do_not_depend_on_how_many_pairs_are_averaged_at_once(monkeypatch:
     )
     frame = rng.integers(-1, 8, count)
     normals = np.broadcast_to([0.0, 0.0, 1.0], places.shape)
-    options = {"uncertainty": known, "frame": frame, "disc_mm": 3.0, "deep_mm": 2.0}
-    whole = average_locally(places, normals, points, **options)
+    given = places, normals, SurfaceSample(points, known, frame)
+    whole = average_locally(*given, disc_mm=3.0, deep_mm=2.0)
     assert 10 < np.isnan(whole.mean_mm).sum() < 50
     monkeypatch.setattr("uwlts.comparison.local_means._PAIRS_AT_A_TIME", 70)
-    for one, other in zip(whole, average_locally(places, normals, points, **options), strict=True):
+    for one, other in zip(whole, average_locally(*given, disc_mm=3.0, deep_mm=2.0), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12)
 
 
@@ -62,9 +63,8 @@ def test_points_of_an_image_that_err_together_count_once(unit: float) -> None:
     """The variance is that of a mean of five images, times Student's factor of the 40 points, in mm or um."""
     heights = unit * np.array([0.3, -0.2, 0.05, 0.4, -0.1])
     points, image = images(heights, 8)
-    found = average_locally(
-        np.zeros((1, 3)), TURN[:, 2][None], points, uncertainty=None, frame=image, disc_mm=2.1, deep_mm=1.0
-    )
+    sample = SurfaceSample(points, None, image)
+    found = average_locally(np.zeros((1, 3)), TURN[:, 2][None], sample, disc_mm=2.1, deep_mm=1.0)
     assert found.mean_mm[0] == pytest.approx(heights.mean())
     student = 2.0227 / TWO_SIDED
     assert found.variance_mm2[0] == pytest.approx(student**2 * heights.var(ddof=1) / 5, rel=1e-4)
@@ -78,11 +78,13 @@ def test_a_disc_holds_the_points_within_its_radius_and_depth() -> None:
     rings = [2.99 * ring + 1.0 * up, 3.01 * ring + 2.0 * up, ring + 4.99 * up, ring - 5.01 * up]
     place = np.array([7.0, -3.0, 20.0])
     points = (place + np.vstack(rings)) @ TURN.T
-    options = {"uncertainty": None, "frame": None, "disc_mm": 6.0, "deep_mm": 5.0}
-    found = average_locally((TURN @ place)[None], TURN[:, 2][None], points, **options)
+    found, few = (
+        average_locally((TURN @ place)[None], TURN[:, 2][None], SurfaceSample(some), disc_mm=6.0, deep_mm=5.0)
+        for some in (points, points[:4])
+    )
     assert found.mean_mm[0] == pytest.approx((1.0 + 4.99) / 2)
     # Four points are too few.
-    assert np.isnan(average_locally((TURN @ place)[None], TURN[:, 2][None], points[:4], **options).mean_mm[0])
+    assert np.isnan(few.mean_mm[0])
 
 
 def test_variance_of_a_mean_without_scatter_is_that_stated() -> None:
@@ -97,9 +99,8 @@ def test_variance_of_a_mean_without_scatter_is_that_stated() -> None:
     known = PointUncertainty(
         np.tile(random, (count, 1)), np.tile(position, (count, 1)), patterns, np.tile(pose, (1, count, 1))
     )
-    found = average_locally(
-        np.zeros((1, 3)), normal[None], points, uncertainty=known, frame=image, disc_mm=2.1, deep_mm=1.0
-    )
+    sample = SurfaceSample(points, known, image)
+    found = average_locally(np.zeros((1, 3)), normal[None], sample, disc_mm=2.1, deep_mm=1.0)
     expected = normal @ full @ normal / 24 + ((position @ normal) ** 2 + (pose @ normal) ** 2) / 4
     assert found.variance_mm2[0] == pytest.approx(expected)
     np.testing.assert_allclose(found.patterns_mm[0], [2 * normal[2], 11.5 * normal[0]])

@@ -45,10 +45,11 @@ def test_pits_are_found_in_heavy_tails(noise: Noise) -> None:
         Bump(along_mm=-15.0 + 10 * k, angle=-2.0 + k, diameter_mm=6.0 + 2 * k, height_mm=-0.3, profile="paraboloid")
         for k in range(4)
     ]
-    found = searched(short_pipe(9, noise, pits)).indications
+    pipe = short_pipe(9, noise, pits)
+    found, (along, angle) = searched(pipe).indications, pipe.own_places(pipe.points_mm)
     for pit in pits:
-        place = np.array([pit.along_mm, 60.0 * pit.angle])
-        own = [each for each in found if np.hypot(*(each.place - place)) < 0.5 * pit.diameter_mm]
+        off = np.column_stack([along - pit.along_mm, 60.0 * (angle - pit.angle)])
+        own = [each for each in found if np.hypot(*off[each.points].mean(axis=0)) < 0.5 * pit.diameter_mm]
         assert len(own) == 1 and own[0].height_mm < -0.1, pit
 
 

@@ -36,7 +36,7 @@ def evidence(
     weights = rng.uniform(0.5, 2.0, count)
     weights[0] = 0.0
     known = rng.normal(size=count), weights, rng.uniform(0.05, 0.2, count)
-    return PairEvidence(derivatives, *known, 1.0, np.zeros((poses, poses)), (), np.zeros((count, 3)), count, 0)
+    return PairEvidence(derivatives, *known, 1.0, np.zeros((poses, poses)), (), np.zeros((count, 3)), count)
 
 
 def rows_of(pairs: list[PairEvidence]) -> tuple[np.ndarray, np.ndarray]:

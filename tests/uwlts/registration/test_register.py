@@ -88,7 +88,7 @@ def test_the_agreement_of_a_pair_is_that_of_its_residuals():
     distances, centres = np.array([0.1, -0.2, 5.0, 0.4]), np.array([0.5, -1.0, 2.0, 0.0, 1.0, -0.5])
     weights = np.array([1.0, 2.0, 0.0, 1.0, *np.ones(6)])
     residuals, places = np.append(distances, centres), np.arange(12.0).reshape(4, 3)
-    pair = PairEvidence(np.ones((10, 1)), residuals, weights, np.ones(10), 1.5, np.zeros((1, 1)), (), places, 4, 2)
+    pair = PairEvidence(np.ones((10, 1)), residuals, weights, np.ones(10), 1.5, np.zeros((1, 1)), (), places, 4)
     assert pair.normal() == [[10.0]] and pair.gradient() == pytest.approx([0.1 - 0.4 + 0.4 + 2.0])
     fit = _pair_fit(None, (0, 1), {(0, 1): pair}, None)
     assert (fit.patches, fit.spheres, fit.scatter, fit.closure_mm) == (3, 2, 1.5, None)

@@ -7,13 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from uwlts.registration.surface_registration import (
-    Nearest,
-    Registration,
-    SurfaceSample,
-    register_to_surface,
-    shape_registration,
-)
+from uwlts.registration.surface_registration import Registration, SurfaceSample, register_to_surface, shape_registration
 from uwlts.storage.cloud import PointUncertainty
 
 
@@ -89,9 +83,9 @@ def test_the_uncertainty_of_a_fitted_plane_is_that_of_its_residuals() -> None:
     x, y = (each.ravel() for each in np.meshgrid(side, side, indexing="ij"))
     points, up = np.column_stack([x, y, np.zeros(100)]), np.tile([0.0, 0.0, 1.0], (100, 1))
     size, image = 0.03, np.repeat(np.arange(5), 20)
-    near = Nearest(size * np.where((x + y) % 2 == 0, 1.0, -1.0), up)
+    near = (size * np.where((x + y) % 2 == 0, 1.0, -1.0), up)
     known = PointUncertainty(np.zeros((100, 6)), 0.2 * up, np.stack([0.5 * up, 0.01 * y[:, None] * up]))
-    plain = shape_registration(points, near, sized=False, uncertainty=None, frame=None)
+    plain = shape_registration(SurfaceSample(points), *near, sized=False)
     assert plain.rms_mm == pytest.approx(size) and plain.counted == 100
     assert plain.by_cloud.shape == plain.by_reference.shape == (0, 6)
     expected = size**2 * np.array([0, 0, 1 / 100, 1 / (y @ y), 1 / (x @ x), 0])
@@ -99,7 +93,7 @@ def test_the_uncertainty_of_a_fitted_plane_is_that_of_its_residuals() -> None:
     # Halfway to the border: the offset and one tilt.
     std = plain.std_along(np.array([[0.0, 3.0, 0.0]]), up[:1])
     np.testing.assert_allclose(std, size * np.sqrt(1 / 100 + 9 / (y @ y)))
-    found = shape_registration(points, near, sized=False, uncertainty=known, frame=image)
+    found = shape_registration(SurfaceSample(points, known, image), *near, sized=False)
     assert found.covariance[2, 2] == pytest.approx(expected[2] + 0.2**2 / 5)
     # The motion undoes the errors: a shift, and a turn by the slope.
     np.testing.assert_allclose(found.by_cloud, [[0, 0, -0.5, 0, 0, 0], [0, 0, 0, -0.01, 0, 0]], atol=1e-12)
@@ -110,8 +104,8 @@ def test_the_uncertainty_of_a_fitted_sphere_includes_its_radius() -> None:
     """Points on all axes: their normals have a third of the sum of squares each, and turns are undetermined."""
     normals = np.tile(np.vstack([np.eye(3), -np.eye(3)]), (4, 1))
     size, radius = 0.02, 10.0
-    near = Nearest(size * np.repeat([1.0, -1.0, 1.0, -1.0], 6), normals)
-    found = shape_registration(radius * normals, near, sized=True, uncertainty=None, frame=None)
+    near = (size * np.repeat([1.0, -1.0, 1.0, -1.0], 6), normals)
+    found = shape_registration(SurfaceSample(radius * normals), *near, sized=True)
     expected = size**2 * np.array([1 / 8, 1 / 8, 1 / 8, 0, 0, 0, 1 / 24])
     np.testing.assert_allclose(found.covariance, np.diag(expected), atol=1e-12)
     assert found.std_along(radius * normals[:1], normals[:1])[0] == pytest.approx(size * np.sqrt(1 / 8 + 1 / 24))
