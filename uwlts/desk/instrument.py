@@ -4,7 +4,6 @@ Buttons put tasks into a queue. Only `laser_off`, `pause`, `resume` and `stop` a
 """
 
 import math
-import os
 import queue
 import sys
 import threading
@@ -19,7 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from uwlts.calibration.calibrate import calibrate
-from uwlts.desk.guided import BoardScreen, Ended, darken
+from uwlts.desk.guided import guide
+from uwlts.desk.guided_plan import GuidedPlan
+from uwlts.desk.guided_screen import BoardScreen, Ended, darken
 from uwlts.desk.laser_switch import LaserSwitch
 from uwlts.desk.recording_view import BackgroundView, RecordingView
 from uwlts.desk.shown_state import Board, FrameProfile, Picture
@@ -28,8 +29,6 @@ from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.camera_interface import CameraDevice, GrabbedFrame
 from uwlts.hardware.continuous import ScanListeners
 from uwlts.hardware.grbl import GrblStage
-from uwlts.hardware.guided.guided_plan import GuidedPlan
-from uwlts.hardware.guided.record import guide
 from uwlts.hardware.rig import START_MS, HandSwitchedLaser, LaserStage, Rig, get_stripe, measure_brightness
 from uwlts.hardware.scan_plan import Light, ScanPlan
 from uwlts.hardware.scanning import check_camera, open_camera, record_scan
@@ -472,11 +471,9 @@ class Instrument:
         self.state = InstrumentState.BUSY
         board.phase("guided calibration")
         screen = self._screen = BoardScreen(board, self.switch)
-        nobody = os.open(os.devnull, os.O_RDONLY)
         try:
-            recording = guide(plan, out, screen, resume=resume, overwrite=overwrite, report=board.say, answers=nobody)
+            recording = guide(plan, out, screen, resume=resume, overwrite=overwrite)
         finally:
-            os.close(nobody)
             self._screen, board.request, board.answers = None, "", ()
         for line in recording.missing:
             board.say(f"still missing: {line}; continue it for more images", "warning")

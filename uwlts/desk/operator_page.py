@@ -19,12 +19,12 @@ from uwlts.desk.analysis_panel import AnalysisPanel
 from uwlts.desk.board_page import BoardView, NumberField, build_board, update_regularly
 from uwlts.desk.desk_files import find_file, guess_kind, list_files, new_path
 from uwlts.desk.guided import answer_buttons
+from uwlts.desk.guided_plan import load_guided_plan
 from uwlts.desk.instrument import Instrument, InstrumentState
 from uwlts.desk.measure_panel import MeasurePanel, Measuring
 from uwlts.desk.server import DeskServer
 from uwlts.desk.shown_state import FIELDS, Board, point_table
 from uwlts.errors import DescriptionError, Error
-from uwlts.hardware.guided.guided_plan import load_guided_plan
 from uwlts.hardware.scan_plan import ScanPlan, StagePlan, load_plan
 from uwlts.model.library import validate_description
 from uwlts.report.file_description import describe

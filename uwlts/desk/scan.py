@@ -22,7 +22,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from uwlts.desk.guided import Ended
+from uwlts.desk.guided_screen import Ended
 from uwlts.desk.recording_view import LOOK_S, BackgroundView, follow_frames
 from uwlts.desk.shown_state import FrameProfile
 from uwlts.errors import DescriptionError, Error, HardwareError, SetupError
