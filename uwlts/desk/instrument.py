@@ -1,6 +1,6 @@
 """Camera, stage and laser behind the page: a thread does one task after another and shows live images in between.
 
-Buttons put tasks into a queue. Only `laser_off`, `pause`, `resume` and `stop` act at once.
+Buttons put tasks into its queue by `Instrument.ask`. `laser_off`, `pause`, `resume` and `stop` act at once.
 """
 
 import math
@@ -13,7 +13,9 @@ from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
+from typing import ParamSpec
 
 import numpy as np
 
@@ -25,7 +27,6 @@ from uwlts.desk.laser_switch import LaserSwitch
 from uwlts.desk.recording_view import BackgroundView, RecordingView
 from uwlts.desk.shown_state import Board, FrameProfile, Picture
 from uwlts.errors import DescriptionError, Error, HardwareError
-from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.camera_interface import CameraDevice, GrabbedFrame
 from uwlts.hardware.continuous import ScanListeners
 from uwlts.hardware.grbl import GrblStage
@@ -39,6 +40,7 @@ from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import Capture, Frame, drawable_image, part_path
 from uwlts.stripe import Stripe
 
+_P = ParamSpec("_P")
 _PREVIEW_S = 0.15  # pause between two live images
 _MOST_LOST = 2  # consecutive live images that may be lost before an error is reported
 _UNATTENDED_S = 5.0
@@ -105,7 +107,7 @@ class Instrument:
         self._darkened = True
         darken(connected.stage, self._board)
         self._show_laser()
-        self._ask(self._after_darkening)
+        self._work.put(self._recognise_darkening)
 
     def attend(self) -> None:
         """Record that an operator's page is open; live images with the laser end without it."""
@@ -143,48 +145,6 @@ class Instrument:
         if (screen := self._screen) is not None:
             screen.end()
 
-    # Queued tasks.
-
-    def connect(self, plan: ScanPlan, *, camera: str, stage: str | None) -> None:
-        """Open the camera, and the stage if its port is given, for a plan."""
-        self._ask(lambda: self._connect(plan, camera, stage))
-
-    def disconnect(self) -> None:
-        """Close camera and stage."""
-        self._ask(self._disconnect)
-
-    def home(self) -> None:
-        """Home the stage."""
-        self._ask(lambda: self._moving("homing", lambda stage: stage.home()))
-
-    def unlock(self) -> None:
-        """Unlock the stage and accept its position."""
-        self._ask(lambda: self._moving("unlocking", lambda stage: stage.unlock()))
-
-    def move(self, position_mm: float) -> None:
-        """Move the stage to a position."""
-        self._ask(lambda: self._move(position_mm))
-
-    def jog(self, by_mm: float) -> None:
-        """Move the stage by some mm."""
-        self._ask(lambda: self._jog(by_mm))
-
-    def find_exposure(self) -> None:
-        """Find the exposure for the light that is shown."""
-        self._ask(self._find_exposure)
-
-    def scan(self, plan: ScanPlan, out: Path, *, calibration: Path | None, resume: bool, overwrite: bool) -> None:
-        """Record a scan by a plan, in the worker thread.
-
-        A ``calibration`` gives a cloud that grows during the scan. ``resume`` continues an interrupted capture.
-        """
-        self._ask(lambda: self._scan(plan, out, calibration, resume, overwrite))
-
-    def calibrate(self, plan: GuidedPlan, out: Path, *, resume: bool, overwrite: bool) -> None:
-        """Lead through a guided calibration, which opens camera and stage itself, and calculate it."""
-        refuse_unsuitable(out, overwrite=overwrite)
-        self._ask(lambda: self._calibrate(plan, out, resume, overwrite))
-
     def answer(self, answer: str) -> None:
         """Pass the operator's answer to a guided calibration."""
         if (screen := self._screen) is not None:
@@ -194,13 +154,12 @@ class Instrument:
         """End all tasks and switch the laser off, once."""
         self._ending.set()
         self.stop()
-        self._ask(lambda: None)
+        self._work.put(lambda: None)
         self._thread.join(30.0)
 
-    # Worker thread.
-
-    def _ask(self, work: Callable[[], None]) -> None:
-        self._work.put(work)
+    def ask(self, task: Callable[_P, None], *args: _P.args, **kwargs: _P.kwargs) -> None:
+        """Put a task into the queue of the worker thread."""
+        self._work.put(partial(task, *args, **kwargs))
 
     def _run(self) -> None:
         while not self._ending.is_set():
@@ -210,7 +169,7 @@ class Instrument:
             except queue.Empty:
                 work = self._preview
             self._do(work)
-        self._do(self._disconnect)
+        self._do(self.disconnect)
 
     def _do(self, work: Callable[[], None]) -> None:
         try:
@@ -273,8 +232,11 @@ class Instrument:
             self._board.show(replace(self._live, caption=f"not {self._live.caption}"))
         self._live = None
 
-    def _connect(self, plan: ScanPlan, camera: str, port: str | None) -> None:
-        self._disconnect()
+    # Tasks.
+
+    def connect(self, plan: ScanPlan, *, camera: str, stage: str | None) -> None:
+        """Open the camera, and the stage if its port is given, for a plan."""
+        self.disconnect()
         self.state = InstrumentState.BUSY
         self._board.phase("connecting")
         if not camera:
@@ -284,8 +246,8 @@ class Instrument:
             opened = stack.enter_context(open_camera(camera))
             check_camera(opened, sensor)
             moved: LaserStage = HandSwitchedLaser(self._board.say)
-            if port is not None:
-                moved = stack.enter_context(GrblStage(port))
+            if stage is not None:
+                moved = stack.enter_context(GrblStage(stage))
                 stack.callback(self.switch.lend, None)
                 self.switch.lend(moved)
             self._connected = _Connected(plan, sensor, opened, moved, stack.pop_all())
@@ -293,13 +255,14 @@ class Instrument:
         self._board.say(f"connected: {opened.info.name} {opened.info.serial}".strip())
         if isinstance(moved, GrblStage):
             low, high = moved.limits_mm
-            self._board.say(f"connected: Grbl {moved.version} on {port}, travel {low:g} to {high:g} mm")
+            self._board.say(f"connected: Grbl {moved.version} on {stage}, travel {low:g} to {high:g} mm")
             self._board.position_mm = moved.position_mm() if moved.position_known else None
         else:
             self._board.say("no stage is connected: images are shown, nothing can be scanned")
         self.light = "lamp"
 
-    def _disconnect(self) -> None:
+    def disconnect(self) -> None:
+        """Close camera and stage."""
         connected, self._connected, self._rig, self.light = self._connected, None, None, None
         self._end_live()
         if connected is not None:
@@ -328,17 +291,27 @@ class Instrument:
         self._board.position_mm = work(stage)
         self._board.say(f"{phase} done: the stage is at {self._board.position_mm:.3f} mm")
 
-    def _move(self, position_mm: float) -> None:
+    def home(self) -> None:
+        """Home the stage."""
+        self._moving("homing", GrblStage.home)
+
+    def unlock(self) -> None:
+        """Unlock the stage and accept its position."""
+        self._moving("unlocking", GrblStage.unlock)
+
+    def move(self, position_mm: float) -> None:
+        """Move the stage to a position."""
         connected = self._begin(f"moving to {position_mm:.3f} mm")
         self._stage(connected)
         self._board.position_mm = self._rig_of(connected).move_to(position_mm)
 
-    def _jog(self, by_mm: float) -> None:
+    def jog(self, by_mm: float) -> None:
+        """Move the stage by some mm."""
         stage = self._stage(self._begin("moving"))
         low, high = stage.limits_mm
-        self._move(float(np.clip(stage.position_mm() + by_mm, low, high)))
+        self.move(float(np.clip(stage.position_mm() + by_mm, low, high)))
 
-    def _after_darkening(self) -> None:
+    def _recognise_darkening(self) -> None:
         connected = self._connected
         if connected is not None and isinstance(connected.stage, GrblStage) and not connected.stage.faulty:
             # The next exchange detects the reset and sets the fault.
@@ -346,7 +319,8 @@ class Instrument:
                 connected.stage.position_mm()
         self._darkened = False
 
-    def _find_exposure(self) -> None:
+    def find_exposure(self) -> None:
+        """Find the exposure for the light that is shown."""
         light, connected = self.light, self._begin("finding the exposure")
         if light is None:
             raise HardwareError("choose first which light is shown")
@@ -411,7 +385,11 @@ class Instrument:
             self.calibration = None
             self._board.say(f"no profile is shown: {error}", "error")
 
-    def _scan(self, plan: ScanPlan, out: Path, calibration: Path | None, resume: bool, overwrite: bool) -> None:
+    def scan(self, plan: ScanPlan, out: Path, *, calibration: Path | None, resume: bool, overwrite: bool) -> None:
+        """Record a scan by a plan.
+
+        A ``calibration`` gives a cloud that grows during the scan. ``resume`` continues an interrupted capture.
+        """
         known: AnyCalibration | None = None if calibration is None else load_calibration(calibration)
         connected, board = self._begin("beginning the scan"), self._board
         stage = self._stage(connected)
@@ -465,8 +443,9 @@ class Instrument:
         board.say(f"wrote {out.name}")
         board.phase("finished", busy=False)
 
-    def _calibrate(self, plan: GuidedPlan, out: Path, resume: bool, overwrite: bool) -> None:
-        self._disconnect()
+    def calibrate(self, plan: GuidedPlan, out: Path, *, resume: bool, overwrite: bool) -> None:
+        """Lead through a guided calibration, which opens camera and stage itself, and calculate it."""
+        self.disconnect()
         board = self._board
         self.state = InstrumentState.BUSY
         board.phase("guided calibration")

@@ -25,6 +25,7 @@ from uwlts.desk.measure_panel import MeasurePanel, Measuring
 from uwlts.desk.server import DeskServer
 from uwlts.desk.shown_state import FIELDS, Board, point_table
 from uwlts.errors import DescriptionError, Error
+from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.scan_plan import ScanPlan, StagePlan, load_plan
 from uwlts.model.library import validate_description
 from uwlts.report.file_description import describe
@@ -272,6 +273,7 @@ class _OperatorPage:
     # Connect
 
     def _connect_part(self) -> None:
+        device, ask = self._instrument, self._instrument.ask
         plans, plan = self._desk.plans(load_plan), self._desk.plan
         chosen = None if self._desk.plan_path is None else str(self._desk.plan_path)
         # Here and below, values are passed to the constructors: a value set later reaches the browser as a message, and
@@ -283,7 +285,7 @@ class _OperatorPage:
         self._stage = ui.input("stage", value=stage, placeholder="/dev/ttyACM0; empty: none").classes("w-full")
         with ui.row():
             self._button("connect", self._connect, (InstrumentState.DISCONNECTED, *_FREE))
-            self._button("disconnect", self._instrument.disconnect, _FREE).props("outline")
+            self._button("disconnect", partial(ask, device.disconnect), _FREE).props("outline")
         ui.separator()
         ui.label("live image").classes("text-sm")
         self._light = ui.toggle({"lamp": "lamp", "laser": "laser", "none": "stop"}, value="none")
@@ -293,7 +295,7 @@ class _OperatorPage:
         with ui.element("div").classes("fields"):
             self._exposure = NumberField("exposure, ms", value=self._exposed[1], min=0.001, step=0.1, format="%.3g")
             self._exposure.on("change", self._expose)
-            self._button("find exposure", self._instrument.find_exposure, (InstrumentState.READY,)).props("outline")
+            self._button("find exposure", partial(ask, device.find_exposure), (InstrumentState.READY,)).props("outline")
         ui.label("The laser is on only while an image is exposed.").classes("text-xs")
 
     def _choose(self) -> None:
@@ -315,7 +317,8 @@ class _OperatorPage:
         return self._desk.plan
 
     def _connect(self) -> None:
-        self._instrument.connect(self._chosen_plan(), camera=self._camera.value or "", stage=self._stage.value or None)
+        addresses = {"camera": self._camera.value or "", "stage": self._stage.value or None}
+        self._instrument.ask(self._instrument.connect, self._chosen_plan(), **addresses)
 
     def _look(self, light: str) -> None:
         wanted = None if light == "none" else "laser" if light == "laser" else "lamp"
@@ -335,19 +338,20 @@ class _OperatorPage:
     # Stage
 
     def _stage_part(self) -> None:
+        device, ask = self._instrument, self._instrument.ask
         with ui.row():
-            self._button("home", self._instrument.home, _FREE)
-            self._button("unlock", self._instrument.unlock, _FREE).props("outline")
+            self._button("home", partial(ask, device.home), _FREE)
+            self._button("unlock", partial(ask, device.unlock), _FREE).props("outline")
         ui.label("Unlock only where nothing moved since the position was known.").classes("text-xs")
         with ui.row().classes("gap-1"):
             for by in _JOGS_MM:
                 label = f"{by:+g}".replace("-", "−")
-                self._button(label, partial(self._instrument.jog, by), (InstrumentState.READY,)).props(
+                self._button(label, partial(ask, device.jog, by), (InstrumentState.READY,)).props(
                     f'outline dense aria-label="move by {by:+g} mm"'
                 )
         with ui.row().classes("items-center"):
             place = NumberField("position, mm", value=0.0, format="%.3f")
-            self._button("move", lambda: self._instrument.move(float(place.value or 0.0)), (InstrumentState.READY,))
+            self._button("move", lambda: ask(device.move, float(place.value or 0.0)), (InstrumentState.READY,))
 
     # Calibrate
 
@@ -373,7 +377,9 @@ class _OperatorPage:
         plan = load_guided_plan(Path(self._guided_plan.value))
         plan = plan.with_connection(camera=self._camera.value or None, port=self._stage.value or None)
         out = new_path(self._desk.folder, self._calibration_name.value or "", suffix=".json")
-        self._instrument.calibrate(plan, out, resume=resume, overwrite=bool(self._replace.value))
+        overwrite = bool(self._replace.value)
+        refuse_unsuitable(out, overwrite=overwrite)
+        self._instrument.ask(self._instrument.calibrate, plan, out, resume=resume, overwrite=overwrite)
 
     # Scan
 
@@ -431,7 +437,8 @@ class _OperatorPage:
             raise DescriptionError(f"{out.name} was interrupted: continue it, give another name, or tick 'replace'")
         known = self._calibration.value
         self._desk.measuring.open(None)
-        self._instrument.scan(
+        self._instrument.ask(
+            self._instrument.scan,
             plan.model_copy(update={"stage": stage}),
             out,
             calibration=self._desk.folder / known if known else None,
