@@ -38,7 +38,7 @@ def examine(
         Subject, status, result and advice of each check.
     """
     parts: list[Callable[[], Sequence[Finding]]] = [
-        _examine_libraries,
+        machine.examine_libraries,
         machine.examine_renderer,
         devices.examine_cameras,
         devices.examine_ports,
@@ -60,10 +60,3 @@ def examine(
             )
     progress(len(parts), len(parts))
     return findings
-
-
-def _examine_libraries() -> list[Finding]:
-    # The module needs the library packaging, whose absence is also a finding.
-    from uwlts.doctor import libraries
-
-    return libraries.examine()

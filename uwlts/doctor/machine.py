@@ -1,16 +1,20 @@
-"""Findings, their table, and the one about the renderer."""
+"""Findings about Python, libraries and the renderer, and their table."""
 
+import platform
 import shlex
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib import metadata
 from importlib.util import find_spec
 from typing import Literal
 
 from rich import box
 from rich.table import Table
 from rich.text import Text
+
+from uwlts.runtime.optional_library import EXTRAS, pip_install, read_requirements
 
 Status = Literal["ok", "optional", "warning", "missing"]
 
@@ -35,6 +39,63 @@ class Finding:
     def from_advice(cls, subject: str, found: str, advice: str) -> "Finding":
         """Return a warning if there is advice, else ok."""
         return cls(subject, "warning" if advice else "ok", found, advice)
+
+
+_ABSENT = "not installed"
+
+
+def examine_libraries() -> list[Finding]:
+    """Examine Python and all libraries; ImportError without the library packaging."""
+    python, required, extras = read_requirements()
+    return [examine_python(python), *examine_required(required), *examine_optional(extras)]
+
+
+def examine_python(wanted: str) -> Finding:
+    """Examine whether this Python has a version like ``wanted``, such as ">=3.11"."""
+    from packaging.specifiers import SpecifierSet
+
+    found = f"{platform.python_version()} on {platform.system()} {platform.machine()}, {sys.executable}"
+    if not SpecifierSet(wanted).contains(platform.python_version(), prereleases=True):
+        return Finding("Python", "missing", f"{found}; needed is {wanted}", f"install Python {wanted}")
+    advice = "" if sys.platform == "linux" else "use Linux for cameras and stage: nothing else has been tried"
+    return Finding.from_advice("Python", found, advice)
+
+
+def examine_required(requirements: Sequence[str]) -> list[Finding]:
+    """Return one finding for all installed libraries in a suitable version, and one for every other."""
+    examined = [(line, *_examine_requirement(line)) for line in requirements]
+    good = ", ".join(f"{name} {version}" for _, name, version, fault in examined if not fault)
+    findings = [Finding("required libraries", "ok", good)] if good else []
+    return findings + [
+        Finding(name, "missing", fault, pip_install([line])) for line, name, _, fault in examined if fault
+    ]
+
+
+def examine_optional(extras: Mapping[str, Sequence[str]], purposes: Mapping[str, str] = EXTRAS) -> list[Finding]:
+    """Examine the libraries of each extra with a purpose; absent ones are optional, and others that fail a warning."""
+    findings = []
+    for extra, purpose in purposes.items():
+        examined = [_examine_requirement(line) for line in extras[extra]]
+        texts = ", ".join(f"{name} {fault or version}" for name, version, fault in examined)
+        faults = {fault for _, _, fault in examined if fault}
+        status = "ok" if not faults else "optional" if faults == {_ABSENT} else "warning"
+        advice = f"only for {purpose}:\n{pip_install(extras[extra])}" if faults else ""
+        findings.append(Finding(extra, status, f"{texts}; for {purpose}", advice))
+    return findings
+
+
+def _examine_requirement(line: str) -> tuple[str, str, str]:
+    """Return a required library's name, its version, and its fault, or an empty text."""
+    from packaging.requirements import Requirement
+
+    wanted = Requirement(line)
+    try:
+        version = metadata.version(wanted.name)
+    except metadata.PackageNotFoundError:
+        return wanted.name, "", _ABSENT
+    if wanted.specifier.contains(version, prereleases=True):
+        return wanted.name, version, ""
+    return wanted.name, version, f"{version} is installed, {wanted.specifier} is needed"
 
 
 _RENDERER_S = 330  # above the time that the program itself gives its trial

@@ -19,7 +19,7 @@ from packaging.requirements import Requirement
 
 from tests.system.in_process import uwlts
 from twin.devices.grbl_controller import BENCH_SETTINGS, GrblController
-from uwlts.doctor import devices, libraries
+from uwlts.doctor import devices, machine
 from uwlts.doctor.machine import Finding, examine_renderer
 from uwlts.errors import SetupError
 from uwlts.runtime import optional_library
@@ -104,13 +104,13 @@ def test_devices_that_are_named_and_missing_end_in_exit_code_1(tmp_path, monkeyp
 
 
 def test_python_is_compared_with_what_is_required():
-    assert libraries.examine_python(">=3.11").status == "ok"
-    too_old = libraries.examine_python(">=99")
+    assert machine.examine_python(">=3.11").status == "ok"
+    too_old = machine.examine_python(">=99")
     assert too_old.status == "missing" and "needed is >=99" in too_old.found and "install Python" in too_old.advice
 
 
 def test_the_requirements_are_the_projects_own():
-    python, required, extras = libraries.read_requirements()
+    python, required, extras = optional_library.read_requirements()
     assert python == ">=3.11"
     assert {"numpy", "rich", "optuna"} <= {Requirement(line).name for line in required}
     assert "dask" in {Requirement(line).name for lines in extras.values() for line in lines}
@@ -132,7 +132,7 @@ def test_an_installed_package_lists_its_requirements_without_a_checkout(tmp_path
         "Requires-Dist: winonly; sys_platform == 'win32'\nRequires-Dist: laspy>=2; extra == 'clouds'\n"
         "Requires-Dist: anything; extra == 'test'\n"
     )
-    program = "from uwlts.doctor import libraries; print(libraries.read_requirements())"
+    program = "from uwlts.doctor import machine; print(machine.read_requirements())"
     ended = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert ended.stdout.strip() == str(
         (">=3.11", ["numpy>=2"], {extra: [] for extra in EXTRAS} | {"clouds": ["laspy>=2"]})
@@ -140,7 +140,7 @@ def test_an_installed_package_lists_its_requirements_without_a_checkout(tmp_path
 
 
 def test_every_kind_of_missing_library_is_named():
-    found = libraries.examine_required(["numpy>=2", "pydantic>=999", "no-such-library-of-ours>=1"])
+    found = machine.examine_required(["numpy>=2", "pydantic>=999", "no-such-library-of-ours>=1"])
     version = metadata.version("pydantic")
     assert [each.status for each in found] == ["ok", "missing", "missing"]
     assert found[0].found == f"numpy {metadata.version('numpy')}"
@@ -152,7 +152,7 @@ def test_every_kind_of_missing_library_is_named():
 def test_absent_optional_libraries_are_optional_and_old_ones_a_warning():
     extras = {"xyz": ["no-such-library-of-ours>=2", "pytest>=8"], "there": ["pytest"], "old": ["pytest>=999"]}
     purposes = {"xyz": "clouds as XYZ", "there": "tests", "old": "tests"}
-    absent, there, old = libraries.examine_optional(extras, purposes)
+    absent, there, old = machine.examine_optional(extras, purposes)
     version = metadata.version("pytest")
     assert absent.status == "optional"
     assert absent.found == f"no-such-library-of-ours not installed, pytest {version}; for clouds as XYZ"
