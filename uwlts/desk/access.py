@@ -38,7 +38,8 @@ _POLICY = (
 
 def is_local(host: str) -> bool:
     """Return whether a host is reachable from this machine only."""
-    return host == "localhost" or _is_loopback(host)
+    address = _address(host)
+    return host == "localhost" or (address is not None and address.is_loopback)
 
 
 def _address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
@@ -46,11 +47,6 @@ def _address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
         return ipaddress.ip_address(name)
     except ValueError:
         return None
-
-
-def _is_loopback(name: str) -> bool:
-    address = _address(name)
-    return address is not None and address.is_loopback
 
 
 @dataclass(frozen=True)

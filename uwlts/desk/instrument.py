@@ -90,6 +90,12 @@ class Instrument:
         self._thread = threading.Thread(target=self._run, name="instrument", daemon=True)
         self._thread.start()
 
+    @property
+    def _grbl(self) -> GrblStage | None:
+        # Read once: another thread may disconnect.
+        connected = self._connected
+        return connected.stage if connected is not None and isinstance(connected.stage, GrblStage) else None
+
     # Immediate actions.
 
     def laser_off(self) -> None:
@@ -98,14 +104,13 @@ class Instrument:
         if (screen := self._screen) is not None:
             screen.laser_off()
             return
-        connected = self._connected
-        if connected is None or not isinstance(connected.stage, GrblStage):
+        if (stage := self._grbl) is None:
             self._board.say("laser off: no laser is connected", "warning")
             return
         self._stop.set()
         self._paused.clear()
         self._darkened = True
-        darken(connected.stage, self._board)
+        darken(stage, self._board)
         self._show_laser()
         self._work.put(self._recognise_darkening)
 
@@ -188,10 +193,10 @@ class Instrument:
         self._settle_state()
 
     def _settle_state(self) -> None:
-        connected, board = self._connected, self._board
-        if connected is None:
+        stage, board = self._grbl, self._board
+        if self._connected is None:
             self.state = InstrumentState.DISCONNECTED
-        elif isinstance(connected.stage, GrblStage) and not connected.stage.position_known:
+        elif stage is not None and not stage.position_known:
             self.state = InstrumentState.LOCKED
         else:
             self.state = InstrumentState.READY
@@ -201,8 +206,7 @@ class Instrument:
         self._show_laser()
 
     def _show_laser(self) -> None:
-        stage = None if self._connected is None else self._connected.stage
-        if not isinstance(stage, GrblStage):
+        if (stage := self._grbl) is None:
             self._board.laser = "none"
         elif stage.laser_unreachable:
             self._board.laser = "unknown"
@@ -214,8 +218,7 @@ class Instrument:
             self._board.laser = "flashing" if used else "off"
 
     def _switches_laser(self) -> bool:
-        stage = None if self._connected is None else self._connected.stage
-        return isinstance(stage, GrblStage) and stage.position_known
+        return (stage := self._grbl) is not None and stage.position_known
 
     def _begin(self, phase: str) -> _Connected:
         if self._connected is None:
@@ -273,10 +276,10 @@ class Instrument:
                 self._board.say(str(error), "warning")
             self._board.say("disconnected")
 
-    def _stage(self, connected: _Connected) -> GrblStage:
-        if not isinstance(connected.stage, GrblStage):
+    def _stage(self) -> GrblStage:
+        if (stage := self._grbl) is None:
             raise HardwareError("no stage is connected")
-        return connected.stage
+        return stage
 
     def _rig_of(self, connected: _Connected) -> Rig:
         """Return the rig, a new one after another task has used camera or stage."""
@@ -286,7 +289,8 @@ class Instrument:
         return self._rig
 
     def _moving(self, phase: str, work: Callable[[GrblStage], float]) -> None:
-        stage, self._rig = self._stage(self._begin(phase)), None
+        self._begin(phase)
+        stage, self._rig = self._stage(), None
         self._stop.clear()
         self._board.position_mm = work(stage)
         self._board.say(f"{phase} done: the stage is at {self._board.position_mm:.3f} mm")
@@ -302,21 +306,21 @@ class Instrument:
     def move(self, position_mm: float) -> None:
         """Move the stage to a position."""
         connected = self._begin(f"moving to {position_mm:.3f} mm")
-        self._stage(connected)
+        self._stage()
         self._board.position_mm = self._rig_of(connected).move_to(position_mm)
 
     def jog(self, by_mm: float) -> None:
         """Move the stage by some mm."""
-        stage = self._stage(self._begin("moving"))
+        self._begin("moving")
+        stage = self._stage()
         low, high = stage.limits_mm
         self.move(float(np.clip(stage.position_mm() + by_mm, low, high)))
 
     def _recognise_darkening(self) -> None:
-        connected = self._connected
-        if connected is not None and isinstance(connected.stage, GrblStage) and not connected.stage.faulty:
+        if (stage := self._grbl) is not None and not stage.faulty:
             # The next exchange detects the reset and sets the fault.
             with suppress(HardwareError):
-                connected.stage.position_mm()
+                stage.position_mm()
         self._darkened = False
 
     def find_exposure(self) -> None:
@@ -392,7 +396,7 @@ class Instrument:
         """
         known: AnyCalibration | None = None if calibration is None else load_calibration(calibration)
         connected, board = self._begin("beginning the scan"), self._board
-        stage = self._stage(connected)
+        stage = self._stage()
         self._stop.clear()
         self._paused.clear()
         header = plan.header(out.stem)

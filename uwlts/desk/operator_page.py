@@ -142,10 +142,6 @@ class _Desk:
                 found[str(path)] = path.name
         return found
 
-    def calibrations(self) -> list[str]:
-        """Return the names of the calibrations."""
-        return [file.name for file in list_files(self.folder) if file.kind == "calibration"]
-
     def show_cloud(self, name: str, cloud: PointCloud, *, of: int | None = None) -> None:
         """Show a cloud, a sample ``of`` that many points, thinned if it is large, and make it the one to measure.
 
@@ -208,31 +204,25 @@ class _OperatorPage:
             view.image()
             view.cloud()
             with ui.element("section").classes("tools").props('aria-label="controls"'):
+                parts = {
+                    "Connect": self._connect_part,
+                    "Stage": self._stage_part,
+                    "Calibrate": self._calibrate_part,
+                    "Scan": self._scan_part,
+                    "Files": self._files_part,
+                    "Inspect": self._analyses.build,
+                    "Measure": self._measure.build,
+                }
                 with ui.tabs().props("dense no-caps align=left") as self._tabs:
-                    names = ["Connect", "Stage", "Calibrate", "Scan", "Files", "Inspect", "Measure"]
-                    shown = {name: ui.tab(name) for name in names}
-                with (
-                    ui.tab_panels(self._tabs, value=shown["Connect"], animated=False)
-                    .classes("w-full")
-                    .props("keep-alive")
-                ):
-                    for name, part in zip(names, self._parts(), strict=True):
-                        with ui.tab_panel(shown[name]).classes("gap-2"):
+                    for name in parts:
+                        ui.tab(name)
+                with ui.tab_panels(self._tabs, value="Connect", animated=False).classes("w-full").props("keep-alive"):
+                    for name, part in parts.items():
+                        with ui.tab_panel(name).classes("gap-2"):
                             part()
             view.log()
         update_regularly(self._refresh)
         ui.timer(_LIST_S, self._list)
-
-    def _parts(self) -> tuple[Callable[[], None], ...]:
-        return (
-            self._connect_part,
-            self._stage_part,
-            self._calibrate_part,
-            self._scan_part,
-            self._files_part,
-            self._analyses.build,
-            self._measure.build,
-        )
 
     def _button(
         self, label: str, press: Callable[[], object], states: tuple[InstrumentState, ...] | None = None
@@ -464,7 +454,8 @@ class _OperatorPage:
         if known == self._files:
             return
         self._files = known
-        self._calibration.set_options(self._desk.calibrations(), value=self._calibration.value)
+        calibrations = [file.name for file in files if file.kind == "calibration"]
+        self._calibration.set_options(calibrations, value=self._calibration.value)
         for choice, load in ((self._plan, load_plan), (self._guided_plan, load_guided_plan)):
             choice.set_options(self._desk.plans(load), value=choice.value)
         self._analyses.set_files()

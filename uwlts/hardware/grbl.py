@@ -179,7 +179,7 @@ class GrblStage:
 
         The controller receives the travel part by part. If this program stops, the stage comes to rest and the laser
         goes off within a second. ``reported`` is called with every `StageReport`; an exception from it brakes the
-        stage, which is then held as by `stop`.
+        stage, which is then held until `unlock` or `home`.
 
         Raises RangeError and HardwareError like `move_to` and `laser`. Also raises HardwareError if the next part was
         sent too late for a constant speed.
@@ -282,7 +282,7 @@ class GrblStage:
     def _motion_watch(self, start_mm: float, feed_mm_s: float) -> Callable[[Status], None]:
         """Return a check of status reports during a movement, for a stall and for states that never end."""
         last_mm, since = start_mm, time.monotonic()
-        patience_s = _STALL_S + _STALL_STEPS * self.settings.step_mm / feed_mm_s
+        patience_s = _STALL_S + _STALL_STEPS / self.settings.steps_per_mm / feed_mm_s
 
         def check(report: Status) -> None:
             nonlocal last_mm, since
@@ -449,28 +449,6 @@ class GrblStage:
                 f"S{power * self.settings.spindle_max:g} was sent (state {report.state}): a hold, a spindle override, "
                 "or $31 above it"
             )
-
-    def stop(self, *, reset: bool = False) -> float:
-        """Brake to rest by a feed hold and return the position in mm.
-
-        Without ``reset`` the controller is held until `unlock` or `home`. The laser keeps its state, except with $32=1:
-        then Grbl switches it off. With ``reset`` the laser goes off and the stage can move again; the position is kept
-        because nothing moves during the reset.
-        """
-        self._line.realtime(FEED_HOLD)
-        braking_s = self.settings.max_feed_mm_per_min / 60 / self.settings.acceleration_mm_per_s2
-        deadline = time.monotonic() + _MARGIN * braking_s + _MARGIN_S
-        # Hold:1 is braking, Hold:0 is at rest.
-        while (report := self._line.status()).state in ("Run", "Hold", "Jog") and report.substate != 0:
-            if time.monotonic() > deadline:
-                raise self._line.stop_and_make_error(
-                    f"the stage does not stop after a feed hold, its state is {report.state}"
-                )
-            time.sleep(POLL_S / 5)
-        self._held = True
-        if reset:
-            self._recover()
-        return self.position_mm()
 
     @property
     def descriptor(self) -> int:

@@ -123,11 +123,6 @@ class GrblSettings:
     spindle_max: float
     laser_mode: bool
 
-    @property
-    def step_mm(self) -> float:
-        """Smallest movement in mm."""
-        return 1 / self.steps_per_mm
-
 
 def parse_settings(values: Mapping[int, float]) -> GrblSettings:
     """Parse the answer to ``$$``; raises HardwareError if the settings cannot move a stage."""
@@ -160,9 +155,8 @@ def parse_settings(values: Mapping[int, float]) -> GrblSettings:
 
 def code_text(kind: Literal["error", "ALARM"], number: int) -> str:
     """Return the meaning of an ``error:N`` or ``ALARM:N``, with advice if the operator can do something."""
-    if kind == "error":
-        return f"error:{number}, {_ERRORS.get(number, 'unknown to Grbl 1.1')}"
-    return f"ALARM:{number}, {_ALARMS.get(number, 'unknown to Grbl 1.1; reset the controller and home')}"
+    known, advice = (_ERRORS, "") if kind == "error" else (_ALARMS, "; reset the controller and home")
+    return f"{kind}:{number}, {known.get(number, f'unknown to Grbl 1.1{advice}')}"
 
 
 _ALARMS = {

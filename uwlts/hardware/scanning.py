@@ -84,19 +84,15 @@ class ScanProgress:
 
     def warnings(self) -> list[str]:
         """Return warnings for the operator."""
-        texts = []
-        if self.saturated:
-            texts.append(f"{self.saturated} laser images are saturated on many lines: shorten laser_ms")
-        if self.faint:
-            texts.append(f"{self.faint} laser images are faint: lengthen laser_ms, or is the laser off?")
-        if self.lines and self.found < 0.05 * self.lines:
-            texts.append(
-                f"only {self.found} of {self.lines} profile lines show a stripe: is the laser on, the object "
-                "in the volume?"
-            )
-        if self.repeated:
-            texts.append(f"{self.repeated} images were lost between camera and computer and taken again")
-        return texts
+        few = self.found < 0.05 * self.lines
+        texts = {
+            f"{self.saturated} laser images are saturated on many lines: shorten laser_ms": self.saturated,
+            f"{self.faint} laser images are faint: lengthen laser_ms, or is the laser off?": self.faint,
+            f"only {self.found} of {self.lines} profile lines show a stripe: is the laser on, the object in the "
+            "volume?": few,
+            f"{self.repeated} images were lost between camera and computer and taken again": self.repeated,
+        }
+        return [text for text, found in texts.items() if found]
 
 
 def record_scan(
@@ -133,16 +129,21 @@ def record_scan(
         images=len(shots),
         background=plan.background,
     )
-    if plan.continuous is not None:
-        if resume:
-            raise DescriptionError("a continuous scan cannot be resumed: give `overwrite` to scan again")
-        plan_passes(plan, plan.continuous, stage)
+
+    def begin(seen: ScanProgress) -> _Taking:
         rig = Rig(plan, plan.stage, sensor, camera, stage, ahead=plan.stage.step_mm)
-        seen = ScanProgress()
         taking = _Taking(plan, sensor, rig, seen, listeners.warn)
         report("finding the exposures")
         taking.settle_exposures(between)
         report("recording")
+        return taking
+
+    if plan.continuous is not None:
+        if resume:
+            raise DescriptionError("a continuous scan cannot be resumed: give `overwrite` to scan again")
+        plan_passes(plan, plan.continuous, stage)
+        seen = ScanProgress()
+        taking = begin(seen)
         placed = record_continuously(
             plan,
             out,
@@ -162,11 +163,7 @@ def record_scan(
         begun = len(writer)
         if begun == len(shots):
             return seen
-        rig = Rig(plan, plan.stage, sensor, camera, stage, ahead=plan.stage.step_mm)
-        taking = _Taking(plan, sensor, rig, seen, listeners.warn)
-        report("finding the exposures")
-        taking.settle_exposures(between)
-        report("recording")
+        taking = begin(seen)
         start_s = time.monotonic() - before_s
         for done, (position_mm, (light, multiple)) in enumerate(shots[begun:], begun + 1):
             between()

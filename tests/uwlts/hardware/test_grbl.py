@@ -305,7 +305,7 @@ def test_blocks_hold_words_and_commands_apart():
 def test_opening_reads_version_settings_and_state(controller):
     with GrblStage(controller.port) as stage:
         assert stage.version == "1.1h"
-        assert (stage.settings.step_mm, stage.settings.travel_mm) == (STEP_MM, 750.0)
+        assert (1 / stage.settings.steps_per_mm, stage.settings.travel_mm) == (STEP_MM, 750.0)
         assert stage.limits_mm == (0.0, 750.0)
         assert not stage.position_known
         with pytest.raises(HardwareError, match="home it first"):
@@ -519,32 +519,6 @@ def test_a_laser_that_gives_no_light_is_seen_by_the_twin_alone(controller, stage
     controller.inject("break-laser")
     stage.laser(True)
     assert not controller.state().laser_on and stage.laser_power == 1.0
-
-
-# Stopping
-
-
-def interrupt_after(seconds: float) -> threading.Timer:
-    timer = threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGINT))
-    timer.start()
-    return timer
-
-
-@pytest.mark.parametrize("reset", [True, False])
-def test_an_interrupted_movement_can_be_stopped_without_losing_the_position(controller, stage, reset):
-    interrupt_after(0.3)
-    with pytest.raises(KeyboardInterrupt):
-        stage.move_to(700.0, feed_mm_per_min=200.0)  # 2 s
-    stopped_mm = stage.stop(reset=reset)
-    assert 10.0 < stopped_mm < 690.0
-    assert not controller.state().laser_on and not controller.state().moving
-    if not reset:
-        with pytest.raises(HardwareError, match="held"):
-            stage.move_to(20.0, feed_mm_per_min=900.0)
-        assert stage.unlock() == stopped_mm
-    assert stage.move_to(stopped_mm + 1, feed_mm_per_min=900.0) == pytest.approx(stopped_mm + 1, abs=1e-9)
-    # Within a step, as the stop is between steps.
-    assert controller.state().position_mm == pytest.approx(stopped_mm + 1, abs=STEP_MM)
 
 
 # Faults
