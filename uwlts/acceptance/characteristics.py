@@ -183,12 +183,12 @@ RULES: dict[DecisionRule, str] = {
 }
 """Text of each decision rule, with its edition."""
 
-_DECISIONS: dict[Verdict, Decision] = {
-    "within the limit": "conformity proven",
-    "exceeds the limit": "nonconformity proven",
-    "undecided": "undecided",
+_DECISIONS: dict[Verdict, tuple[Decision, Decision]] = {
+    "within the limit": ("conformity proven", "accepted"),
+    "exceeds the limit": ("nonconformity proven", "rejected"),
+    "undecided": ("undecided", "undecided"),
 }
-_SIMPLE: dict[Verdict, Decision] = {"within the limit": "accepted", "exceeds the limit": "rejected"}
+"""Decision with a guard band, and that of simple acceptance."""
 
 
 class StoredPart(BaseModel):
@@ -262,10 +262,6 @@ class Characteristic(StoredPart):
     reason: str = ""
     probability: Annotated[float, Field(ge=0, le=1)] | None = None
     mpe_mm_per_m: Spread = 0.0
-
-    def limit_mm(self, value: CharacteristicValue) -> float | None:
-        """Return the maximum permissible error of a value, mm; None if it is not stated."""
-        return _limit_mm(value, self.mpe_mm, self.mpe_mm_per_m)
 
     def limit_text(self) -> str:
         """Return the maximum permissible error as text without its unit mm; empty if it is not stated."""
@@ -355,7 +351,7 @@ def judge_characteristic(
 ) -> Characteristic:
     """Return a characteristic with its worst value and the decision; for the limits see `Characteristic`."""
     own = [each for each in values if each.symbol == symbol]
-    limits = [_limit_mm(each, mpe_mm, mpe_mm_per_m) for each in own]
+    limits = [None if mpe_mm is None else mpe_mm + 1e-3 * mpe_mm_per_m * (each.length_mm or 0.0) for each in own]
     guard = _GUARDS[rule] / COVERAGE_FACTOR
     beyond = [
         abs(each.value_mm) + guard * (each.expanded_mm or 0.0) - (limit or 0.0)
@@ -380,22 +376,15 @@ def judge_characteristic(
     )
 
 
-def _limit_mm(value: CharacteristicValue, mpe_mm: float | None, mpe_mm_per_m: float) -> float | None:
-    return None if mpe_mm is None else mpe_mm + 1e-3 * mpe_mm_per_m * (value.length_mm or 0.0)
-
-
 def _decide(value: CharacteristicValue, limit_mm: float | None, rule: DecisionRule) -> tuple[Decision, str]:
     """Return the decision on one value, and the reason of an open one."""
     if limit_mm is None:
         return "no MPE", ""
-    size = abs(value.value_mm)
-    if rule == "simple":
-        return _SIMPLE[judge_interval(size, size, upper=limit_mm)], ""
-    where = f"{value.position}, {value.label}"
-    if value.expanded_mm is None:
+    size, where = abs(value.value_mm), f"{value.position}, {value.label}"
+    if value.expanded_mm is None and rule != "simple":
         return "undecided", f"the certificate states too little for a test value uncertainty ({where})"
-    guard = _GUARDS[rule] / COVERAGE_FACTOR * value.expanded_mm
-    decision = _DECISIONS[judge_interval(size - guard, size + guard, upper=limit_mm)]
+    guard = _GUARDS[rule] / COVERAGE_FACTOR * (value.expanded_mm or 0.0)
+    decision = _DECISIONS[judge_interval(size - guard, size + guard, upper=limit_mm)][rule == "simple"]
     return decision, f"the limit is within the guard band ({where})" if decision == "undecided" else ""
 
 

@@ -390,7 +390,7 @@ class StepPhase:
             image,
             self.calibration,
             self.window,
-            self.step.standard(),
+            self.step,
             medium_index=self.sensor.medium(self.step.medium).refractive_index(self.sensor.laser.wavelength_nm),
             full_dn=self.sensor.detector.full_scale_dn(),
         )
