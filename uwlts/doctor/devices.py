@@ -150,7 +150,7 @@ def try_stage(port: str) -> list[Finding]:
 
     try:
         with GrblLine(port) as line:
-            settings, options, report = line.settings(), line.options(), line.status()
+            settings, options, report = line.read_settings(), line.options(), line.status()
     except HardwareError as failed:
         advice = "see 'In case of trouble' in docs/how-to/hardware-stage.md"
         if "no permission" in str(failed):

@@ -238,6 +238,8 @@ _ASKED_TO_DARKEN = "the laser was switched off by hand: unlock the stage if it s
 class GrblLine:
     """Open line to a controller of version 1.1, which has just restarted. Not thread-safe, apart from `darken`.
 
+    The ``with`` ends with the laser off. ``laser_unreachable``: the last command to switch it off could not be sent.
+
     ``port`` is a serial port such as /dev/ttyACM0. ``boot_s`` is the longest time to the greeting of a controller that
     restarts when the port is opened; after that Ctrl-X requests the greeting. Raises HardwareError if the port is
     missing, forbidden or in use, nothing answers, or the answer is not that of Grbl 1.1.
@@ -252,7 +254,7 @@ class GrblLine:
         self._serial = _open_port(port)
         self._guard: Heartbeat | None = None
         self._lit, self._beaten_s = False, -math.inf
-        self.darkened_by_hand, self._writing, self.unreachable = False, threading.Lock(), False
+        self.darkened_by_hand, self._writing, self.laser_unreachable = False, threading.Lock(), False
         try:
             self._hang_up_on_close()
             self._guard = Heartbeat(self._serial.fileno())
@@ -275,7 +277,7 @@ class GrblLine:
         except termios.error as error:
             raise HardwareError(f"the serial port cannot be set up: {error}") from error
 
-    def keep_lit(self, wait_s: float = 0.0) -> None:
+    def announce_light(self, wait_s: float = 0.0) -> None:
         """Tell the guard that the laser is on, or about to be, and that the next beat may take ``wait_s``.
 
         Every exchange with the controller sends a beat. Raises HardwareError if the guard process is gone, or has
@@ -286,7 +288,7 @@ class GrblLine:
         self._beat(wait_s + GRACE_S)
 
     def report_dark(self) -> None:
-        """Tell the guard that the laser is off; raises HardwareError like `keep_lit` if it was on before."""
+        """Tell the guard that the laser is off; raises HardwareError like `announce_light` if it was on before."""
         if self._lit:
             self._beat(math.inf)
             self._lit = False
@@ -367,7 +369,7 @@ class GrblLine:
         if (alarm := self._reset()) is not None:
             raise self.stop_and_make_error(code_text("ALARM", alarm))
 
-    def settings(self) -> dict[int, float]:
+    def read_settings(self) -> dict[int, float]:
         """Return the answer to ``$$``: values by number."""
         return {each.number: each.value for each in self.command("$$") if each.kind == "setting"}
 
@@ -400,13 +402,14 @@ class GrblLine:
 
     @property
     def descriptor(self) -> int:
-        """File descriptor of the open port."""
+        """File descriptor of the open port, for another process that switches the laser off by Ctrl-X."""
         return self._serial.fileno()
 
     def darken(self) -> bool:
-        """Send Ctrl-X from any thread, without waiting for an answer; return whether it could be sent.
+        """Switch the laser off by Ctrl-X, from any thread and in any state, which also stops a movement.
 
-        Until `restart` nothing else is sent: a call in progress fails at its next exchange.
+        Returns whether the command could be sent, without waiting for an answer. Until `restart` nothing else is sent:
+        a call in progress fails at its next exchange. Afterwards unlock a stage if nothing moved, or home it.
         """
         self.darkened_by_hand = True
         # Only for a short time: a write that hangs must not delay the reset.
@@ -418,11 +421,11 @@ class GrblLine:
                 self._writing.release()
 
     def _send_reset(self) -> bool:
-        self.unreachable = True
+        self.laser_unreachable = True
         with suppress(OSError):
             self._serial.write(SOFT_RESET)
-            self.unreachable = False
-        return not self.unreachable
+            self.laser_unreachable = False
+        return not self.laser_unreachable
 
     def restart(self) -> None:
         """Reset by Ctrl-X: the laser goes off and a fault is cleared; the position is kept only if nothing moved."""

@@ -48,7 +48,7 @@ def stage(controller: GrblController) -> Iterator[GrblStage]:
     with GrblStage(controller.port) as opened:
         opened.home()
         yield opened
-        opened._line.fault = opened._line.fault or "test over"
+        opened.fault = opened.fault or "test over"
 
 
 REAL = {"boot_s": 0.2, "position_mm": 30.0, "settings": {24: 2400, 25: 7200, 110: 7200, 120: 2000}}
@@ -68,7 +68,7 @@ def sweeping(real: GrblController) -> Iterator[GrblStage]:
     with GrblStage(real.port) as opened:
         opened.home()
         yield opened
-        opened._line.fault = opened._line.fault or "test over"
+        opened.fault = opened.fault or "test over"
 
 
 # Messages
@@ -311,7 +311,7 @@ def test_opening_reads_version_settings_and_state(controller):
         with pytest.raises(HardwareError, match="home it first"):
             stage.move_to(10.0, feed_mm_per_min=100.0)
         # With this flag DTR drops when any process closes the port.
-        assert termios.tcgetattr(stage._line._serial.fd)[2] & termios.HUPCL
+        assert termios.tcgetattr(stage._serial.fd)[2] & termios.HUPCL
 
 
 def test_resets_of_the_program_before_are_no_fault(controller, monkeypatch):
@@ -391,7 +391,7 @@ def test_positions_count_from_the_lower_end_whatever_grbl_calls_them(settings, o
         assert stage.home() == pytest.approx(home_mm, abs=1e-9)
         # Homing sets the zero after the pull-off, so the controller's zero is beside the switch.
         offset_mm = {"VZ": 2.0 if settings.get(23) else -2.0}.get(options, 0.0)
-        stage._line.command("G92X5")
+        stage.command("G92X5")
         for target_mm in (410.0, 400.0125):
             assert stage.move_to(target_mm, feed_mm_per_min=900.0) == pytest.approx(target_mm, abs=1e-9)
             assert controller.state().position_mm == pytest.approx(target_mm + offset_mm, abs=1e-9)
@@ -482,7 +482,7 @@ def test_the_laser_is_lit_on_the_way_alone(real, sweeping):
     # Back, over a distance shorter than the part that is sent at once.
     assert sweeping.sweep(150.0, feed_mm_per_min=SWEEP) == 150.0
     with pytest.raises(RangeError, match="too fast for a moving stage with the laser on: at most"):
-        sweeping._line.command("$120=100")
+        sweeping.command("$120=100")
         sweeping.settings = replace(sweeping.settings, acceleration_mm_per_s2=100.0)
         sweeping.sweep(200.0, feed_mm_per_min=SWEEP)
 
@@ -563,8 +563,8 @@ def test_a_fault_while_moving_is_named_and_the_laser_is_off(real, sweeping, faul
 def test_a_fault_at_the_moment_of_a_reset_is_named(controller, stage, monkeypatch, fault, message):
     """A light ends by a reset; the greeting after a restart just before it looks like the answer."""
     stage.laser(True, at_most_s=5.0)
-    end = stage._line.end
-    monkeypatch.setattr(stage._line, "end", lambda: (controller.inject(fault), end()))
+    end = stage.end
+    monkeypatch.setattr(stage, "end", lambda: (controller.inject(fault), end()))
     with pytest.raises(HardwareError, match=message):
         stage.laser(False)
     assert not controller.state().laser_on
@@ -750,7 +750,7 @@ LIT = """
     with GrblStage(sys.argv[1]) as stage:
         stage.home()
         stage.laser(True)
-        print(stage._line._guard.pid, flush=True)
+        print(stage._guard.pid, flush=True)
         {then}
 """
 MOVES = """stage.laser(False)
@@ -806,7 +806,7 @@ def test_without_the_guard_the_interlock_and_else_the_controller_end_the_light(g
 
 
 def test_the_laser_is_not_lit_without_its_guard(controller, stage):
-    os.kill(stage._line._guard.pid, signal.SIGKILL)
+    os.kill(stage._guard.pid, signal.SIGKILL)
     with pytest.raises(HardwareError, match="switches the laser off after a crash, is gone"):
         stage.laser(True)
     assert not controller.state().laser_on
@@ -842,19 +842,19 @@ def test_the_controller_ends_a_laser_with_a_time_by_itself(controller, stage):
     assert stage.position_known and stage.move_to(60.0, feed_mm_per_min=900.0) == 60.0
     # Light that ends early is an error: images exposed meanwhile may be dark.
     stage.laser(True, at_most_s=5.0)
-    os.write(stage._line._serial.fileno(), b"\x18")
+    os.write(stage._serial.fileno(), b"\x18")
     with pytest.raises(HardwareError, match="does not follow|restarted"):
         stage.laser(False)
 
 
 def test_a_computer_that_asks_after_a_timed_light_takes_the_darkness_for_no_fault(controller, stage, monkeypatch):
-    begin = stage._line.begin
+    begin = stage.begin
 
     def begin_and_be_late(*lines):
         begin(*lines)
         time.sleep(0.3)
 
-    monkeypatch.setattr(stage._line, "begin", begin_and_be_late)
+    monkeypatch.setattr(stage, "begin", begin_and_be_late)
     stage.laser(True, at_most_s=0.05)
     assert not controller.state().laser_on
     stage.laser(False)
