@@ -10,7 +10,7 @@ import numpy as np
 from nicegui import ui
 from nicegui.element import Element
 
-from uwlts.desk.shown_state import FIELDS, KEPT_LINES, Board, LaserState, Picture, ShownLine
+from uwlts.desk.shown_state import FIELDS, KEPT_LINES, Board, LaserState, Picture
 from uwlts.pages.cloud_figure import THREE, VIEW
 
 
@@ -121,8 +121,10 @@ class BoardView:
             self._count.set_text(f"{name}{board.cloud.total:,} points")
         for line in board.lines(self._line):
             self._line = line.number
+            kind = "" if line.kind == "note" else f"{line.kind}: "
+            when = time.strftime("%H:%M:%S", time.localtime(line.time_s))
             with self._log:
-                shown = ui.label(_line_text(line)).classes(line.kind)
+                shown = ui.label(f"{when}  {kind}{line.text}").classes(line.kind)
             shown.move(target_index=0)
             if len(self._log.default_slot.children) > KEPT_LINES:
                 self._log.remove(-1)
@@ -136,11 +138,6 @@ def _progress_text(board: Board) -> str:
     if progress.left_s is not None:
         text += f", {math.ceil(progress.left_s) // 60} min {math.ceil(progress.left_s) % 60} s left"
     return text if place is None else f"{text} · stage at {place:.3f} mm"
-
-
-def _line_text(line: ShownLine) -> str:
-    kind = "" if line.kind == "note" else f"{line.kind}: "
-    return f"{time.strftime('%H:%M:%S', time.localtime(line.time_s))}  {kind}{line.text}"
 
 
 def _histogram(picture: Picture) -> str:

@@ -53,18 +53,13 @@ def guide(
     *,
     refractions: Literal[1, 2] = 2,
     distortion: tuple[str, ...] = ("k1", "k2"),
-    resume: bool = False,
-    overwrite: bool = False,
+    resume: bool,
+    overwrite: bool,
 ) -> GuidedRecording:
-    """Lead through the images of a calibration on a screen. The errors are those of `uwlts.desk.record_guided`.
-
-    The captures are written beside ``out``, the calibration; ``resume`` continues interrupted ones. ``refractions`` and
-    ``distortion`` are those of the calibration that judges the images.
-    """
-    camera = plan.camera_address()
+    """Lead through the images of a calibration on a screen; parameters and errors as `uwlts.desk.record_guided`."""
     options = CalibrationOptions(refractions=refractions, poses=plan.poses, camera=CameraOptions(distortion=distortion))
     setting = replace(plan.setting(), camera=options.camera)
-    phases = _Phases(plan, setting, camera, screen, resume, overwrite and not resume)
+    phases = _Phases(plan, setting, plan.camera_address(), screen, resume, overwrite and not resume)
     target, step = (out.with_name(f"{out.stem}-{shown}.h5") for shown in ("target", "step"))
     missing = list_missing(phases.target(target))
     if plan.step is not None:

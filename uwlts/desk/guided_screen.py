@@ -6,11 +6,12 @@ import select
 import time
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 
 from uwlts.calibration.guidance.pose_advice import Coverage
 from uwlts.desk.laser_switch import LaserSwitch
-from uwlts.desk.shown_state import Board, Picture, encode_png
+from uwlts.desk.shown_state import Board, Picture
 from uwlts.errors import HardwareError
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.rig import LaserStage
@@ -132,7 +133,7 @@ class BoardScreen:
             place = ((points + 0.5) / [coverage.width_px, coverage.height_px] * size).astype(int)
             place = place[((place >= 0) & (place < size)).all(axis=1)]
             picture[place[:, 1], place[:, 0]] = _DOT
-        self._board.coverage = encode_png(picture)
+        self._board.coverage = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes()
 
     def set_stage(self, stage: LaserStage | None) -> None:
         """Set the stage that now switches the laser, or None once it is closed."""

@@ -150,24 +150,12 @@ class Picture:
             shown[row, column] = _STRIPE
         for u, v in np.rint((np.empty((0, 2)) if self.points is None else self.points) * scale).astype(int).tolist():
             cv2.circle(shown, (u, v), 3, _FOUND, 2, cv2.LINE_AA)
-        return _encode(shown, ".jpg")
+        return cv2.imencode(".jpg", shown)[1].tobytes()
 
     @cached_property
     def histogram(self) -> np.ndarray:
         """Fractions of the pixels in equal intervals of grey value."""
         return np.histogram(self.image, _BINS, (0, self.full_dn + 1))[0] / self.image.size
-
-
-def encode_png(picture: np.ndarray) -> bytes:
-    """Encode a picture (H, W, 3) of uint8 in red, green, blue as PNG."""
-    return _encode(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), ".png")
-
-
-def _encode(picture: np.ndarray, suffix: str) -> bytes:
-    done, data = cv2.imencode(suffix, picture)
-    if not done:
-        raise ValueError(f"a picture of the shape {picture.shape} cannot be encoded as {suffix}")
-    return data.tobytes()
 
 
 @dataclass(frozen=True)
