@@ -263,6 +263,10 @@ class Characteristic(StoredPart):
     probability: Annotated[float, Field(ge=0, le=1)] | None = None
     mpe_mm_per_m: Spread = 0.0
 
+    def limit_mm(self, value: CharacteristicValue) -> float | None:
+        """Return the maximum permissible error of a value, mm; None if it is not stated."""
+        return None if self.mpe_mm is None else self.mpe_mm + 1e-3 * self.mpe_mm_per_m * (value.length_mm or 0.0)
+
     def limit_text(self) -> str:
         """Return the maximum permissible error as text without its unit mm; empty if it is not stated."""
         growth = f" + {self.mpe_mm_per_m:g} L / m" if self.mpe_mm_per_m else ""
@@ -351,7 +355,9 @@ def judge_characteristic(
 ) -> Characteristic:
     """Return a characteristic with its worst value and the decision; for the limits see `Characteristic`."""
     own = [each for each in values if each.symbol == symbol]
-    limits = [None if mpe_mm is None else mpe_mm + 1e-3 * mpe_mm_per_m * (each.length_mm or 0.0) for each in own]
+    stated = {"symbol": symbol, "count": len(own), "mpe_mm": mpe_mm, "mpe_mm_per_m": mpe_mm_per_m}
+    limit_of = Characteristic(**stated, worst=None, decision="undecided").limit_mm
+    limits = [limit_of(each) for each in own]
     guard = _GUARDS[rule] / COVERAGE_FACTOR
     beyond = [
         abs(each.value_mm) + guard * (each.expanded_mm or 0.0) - (limit or 0.0)
@@ -365,14 +371,11 @@ def judge_characteristic(
     chances = [_probability(each, limit) for each, limit in zip(own, limits, strict=True)]
     known = [chance for chance in chances if chance is not None]
     return Characteristic(
-        symbol=symbol,
+        **stated,
         worst=own[int(np.argmax(beyond))] if own else None,
-        count=len(own),
-        mpe_mm=mpe_mm,
         decision=decision,
         reason=reason,
         probability=min(known) if known and len(known) == len(chances) else None,
-        mpe_mm_per_m=mpe_mm_per_m,
     )
 
 

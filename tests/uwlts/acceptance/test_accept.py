@@ -159,6 +159,7 @@ def test_limits_may_grow_with_the_length(found, folder):
         limits = content_of()["mpe"] | {"SD_mm": constant, "SD_mm_per_m": growth}
         judged = of(uwlts.accept(write_plan(folder, "growing.toml", mpe=limits), earlier=found), "SD")
         assert judged.decision == decision
+        assert judged.limit_mm(judged.worst) == pytest.approx(constant + 1e-3 * growth * judged.worst.length_mm)
         assert judged.limit_text() == f"{constant:g} + {growth:g} L / m"
 
 
