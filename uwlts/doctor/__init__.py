@@ -7,7 +7,7 @@ because a library is broken, that becomes a finding.
 from collections.abc import Callable, Sequence
 from functools import partial
 
-from uwlts.doctor import devices, machine
+from uwlts.doctor import machine
 from uwlts.doctor.machine import Finding, print_findings
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 
@@ -40,13 +40,13 @@ def examine(
     parts: list[Callable[[], Sequence[Finding]]] = [
         machine.examine_libraries,
         machine.examine_renderer,
-        devices.examine_cameras,
-        devices.examine_ports,
+        machine.examine_cameras,
+        machine.examine_ports,
     ]
     if camera is not None:
-        parts.append(partial(devices.try_camera, camera))
+        parts.append(partial(machine.try_camera, camera))
     if stage is not None:
-        parts.append(partial(devices.try_stage, stage))
+        parts.append(partial(machine.try_stage, stage))
     findings: list[Finding] = []
     for done, part in enumerate(parts):
         progress(done, len(parts))
