@@ -20,18 +20,9 @@ from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.replay import ReplayCamera
 from uwlts.hardware.rig import START_MS, Brightness, Rig, add_provenance, get_stripe, measure_brightness
 from uwlts.hardware.scan_plan import Light, ScanPlan
-from uwlts.hardware.scan_watch import (
-    LOOKS,
-    LaserWatch,
-    LitPlace,
-    Place,
-    SlipWatch,
-    select_centres,
-    select_evenly,
-    shows_laser,
-)
+from uwlts.hardware.scan_watch import LOOKS, LitPlace, Place, SlipWatch, select_centres, select_evenly, shows_laser
 from uwlts.model.sensor import Sensor
-from uwlts.storage.capture import Capture, Frame, part_path
+from uwlts.storage.capture import Capture, Frame, Seen, part_path
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.import_.grey_values import subtract_background
 from uwlts.stripe import Stripe, StripeStatus
@@ -64,6 +55,8 @@ def open_camera(address: str) -> CameraDevice:
 
 _FAINT = 0.1  # laser images below this fraction of full scale are reported as faint
 _EXPOSED_AT = 5  # number of positions, evenly distributed over a plan, used by automatic exposure
+_DROP = 0.5  # a stripe whose number of lines or level is below this fraction of the previous image's is checked
+_AGAIN = 25  # number of images without a stripe after which the laser is checked again
 
 
 @dataclass
@@ -229,13 +222,21 @@ def check_lines_plan(plan: ScanPlan) -> None:
 
 
 class _Taking:
-    """Images of a scan, with exposures settled before the first one of each light."""
+    """Images of a scan, with exposures settled before the first one of each light, and checks of laser and stage.
+
+    An image without a stripe may be correct, before or after the object. If the stripe is missing, or much smaller than
+    in the previous image, an image with the laser off is taken. If both show the same, the stage returns to where the
+    stripe was last seen. If the stripe is there, the scan continues; if not, the laser has failed. A scan that has not
+    yet seen a stripe searches for one at positions over the whole plan.
+    """
 
     def __init__(self, plan: ScanPlan, sensor: Sensor, rig: Rig, seen: ScanProgress, warn: Callable[[str], None]):
         self._plan, self._sensor, self._rig, self._seen, self._warn = plan, sensor, rig, seen, warn
         self._positions_mm = plan.stage.positions_mm()
-        self._watch = LaserWatch(rig, sensor, self._positions_mm, difference=plan.background)
         self._slip = SlipWatch()
+        self._lit: LitPlace | None = None
+        self._usual: tuple[int, float] | None = None
+        self._without = 0
 
     def settle_exposures(self, between: Callable[[], None]) -> None:
         """Set the planned exposures, or the shortest that is needed at positions over the whole plan."""
@@ -256,7 +257,7 @@ class _Taking:
             if light not in exposures:
                 longest_ms = self._sensor.exposure.longest_ms
                 if light == "laser":
-                    raise self._watch.no_light(longest_ms)
+                    raise self._no_light(longest_ms)
                 exposures[light] = longest_ms
 
     def _settle(self, light: Light, position_mm: float) -> None:
@@ -272,9 +273,9 @@ class _Taking:
         if light == "laser":
             # Daylight on an object's edges can look like a stripe at long exposures.
             lit, unlit = (self._rig.image(each, exposure_ms)[0] for each in ("laser", "lamp"))
-            if not shows_laser(lit, unlit, self._sensor, difference=self._plan.background):
+            if not self._shows_laser(lit, unlit):
                 return
-            self._watch.lit = LitPlace(position_mm, exposure_ms)
+            self._lit = LitPlace(position_mm, exposure_ms)
         exposures[light] = min(exposure_ms, exposures.get(light, exposure_ms))
 
     def take(self, position_mm: float, light: Light, multiple: float, *, last: bool) -> Frame:
@@ -301,7 +302,7 @@ class _Taking:
         if light == "laser" and multiple == 1:
             stripe, place = get_stripe(image, self._sensor, background=unlit), LitPlace(position_mm, exposure_ms)
             self._slip.add(Place(position, exposure_ms, select_centres(stripe)))
-            self._watch.check(image, stripe, bright.level, place, unlit=unlit, last=last)
+            self._check_laser(image, stripe, bright.level, place, unlit=unlit, last=last)
             self._count(stripe, bright)
         seen.repeated = rig.repeated
         if zero_dn and isinstance(image, np.ndarray):
@@ -309,6 +310,56 @@ class _Taking:
             lit = image.astype(np.uint16)
             image = lit if unlit is None else subtract_background(image, unlit, clipped, zero_dn=zero_dn)
         return Frame(image, position, light == "laser", exposure_ms, 0.0, encoder=frame.encoder)
+
+    def _shows_laser(self, lit: Seen, unlit: Seen) -> bool:
+        return shows_laser(lit, unlit, self._sensor, difference=self._plan.background)
+
+    def _check_laser(
+        self, image: Seen, stripe: Stripe, level: float, here: LitPlace, *, unlit: np.ndarray | None, last: bool
+    ) -> None:
+        """Check that the laser emitted light in an image or centre line, before it is stored. The stage may move.
+
+        ``level`` is the brightness of the stripe, which is compared with that of the image before. ``unlit`` (H, W) is
+        an image without laser at the same position; if missing, it is taken when it is needed. No further image follows
+        the ``last``. Raises HardwareError if the laser emits no light.
+        """
+        now = (int((stripe.status != StripeStatus.NO_STRIPE).sum()), level)
+        if self._usual is None or any(a < _DROP * b for a, b in zip(now, self._usual, strict=True)):
+            dark = self._rig.frame("lamp", here.exposure_ms).seen if unlit is None else unlit
+            if not self._shows_laser(image, dark):
+                self._without += 1
+                if last or self._without % _AGAIN == 1:
+                    self._look_elsewhere(here)
+                return
+        self._usual, self._lit, self._without = now, here, 0
+
+    def _look_elsewhere(self, here: LitPlace) -> None:
+        """Look for the stripe where it was seen, or over the whole plan; raises HardwareError if it is nowhere."""
+        others = [position for position in select_evenly(self._positions_mm, LOOKS) if position != here.position_mm]
+        for place in [self._lit] if self._lit else [LitPlace(position, here.exposure_ms) for position in others]:
+            self._rig.move_to(place.position_mm)
+            lit, unlit = (self._rig.frame(light, place.exposure_ms).seen for light in ("laser", "lamp"))
+            if self._shows_laser(lit, unlit):
+                self._lit = place
+                self._rig.move_to(here.position_mm)
+                return
+        if self._lit is None:
+            raise self._no_light(here.exposure_ms)
+        passed = self._without - 1
+        also = f"; the {passed} images before this one have no stripe either" if passed else ""
+        raise HardwareError(
+            f"the laser has failed: at {self._lit.position_mm:g} mm, where its stripe was seen before, images with the "
+            f"laser on and off show the same{also}. Check its supply, key and interlock, then continue with `resume`"
+        )
+
+    def _no_light(self, exposure_ms: float) -> HardwareError:
+        """Return the error for a scan that sees no stripe anywhere."""
+        looked = select_evenly(self._positions_mm, LOOKS)
+        return HardwareError(
+            f"no laser light at any of {len(looked)} positions from {looked[0]:g} to {looked[-1]:g} mm, exposed by "
+            f"{exposure_ms:.3g} ms: images with the laser on and off show the same. Is the laser on (supply, key, "
+            "interlock), the object in the volume, the lens cap off?"
+        )
 
     def check_steps(self) -> None:
         """Revisit an early place with relief, if any; raises HardwareError if the stage is displaced."""
