@@ -15,8 +15,7 @@ import numpy as np
 from twin.devices.gige_camera import ExposedFrame, GigeCamera
 from uwlts.desk.recording_view import LOOK_S, RecordingView, follow_frames
 from uwlts.desk.shown_state import Board
-from uwlts.hardware.camera_interface import CameraDevice, CameraSettings, Delivered
-from uwlts.hardware.replay import ReplayCamera
+from uwlts.hardware.camera_interface import CameraDevice, CameraSettings, Delivered, ReplayCamera
 from uwlts.hardware.scanning import open_camera
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor

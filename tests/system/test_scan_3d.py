@@ -17,7 +17,7 @@ from twin.scene.description import Scene
 from twin.sensor.detector import INVALID, PeakFinder
 from uwlts.errors import DescriptionError, HardwareError
 from uwlts.hardware import aravis
-from uwlts.hardware.replay import ReplayCamera
+from uwlts.hardware.camera_interface import ReplayCamera
 from uwlts.hardware.scanning import open_camera
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor

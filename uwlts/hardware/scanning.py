@@ -14,10 +14,9 @@ import numpy as np
 
 from uwlts.errors import DescriptionError, HardwareError
 from uwlts.hardware.aravis import AravisCamera
-from uwlts.hardware.camera_interface import CameraDevice
+from uwlts.hardware.camera_interface import CameraDevice, ReplayCamera
 from uwlts.hardware.continuous import ScanListeners, plan_passes, record_continuously
 from uwlts.hardware.grbl import GrblStage
-from uwlts.hardware.replay import ReplayCamera
 from uwlts.hardware.rig import START_MS, Brightness, Rig, add_provenance, get_stripe, measure_brightness
 from uwlts.hardware.scan_plan import Light, ScanPlan
 from uwlts.hardware.scan_watch import LOOKS, LitPlace, Place, SlipWatch, select_centres, select_evenly, shows_laser

@@ -20,8 +20,8 @@ from uwlts.calibration.sequential.sequential_calibration import CalibrationOptio
 from uwlts.desk import scan
 from uwlts.desk.scan import ScanService
 from uwlts.errors import CalibrationError, HardwareError
+from uwlts.hardware.camera_interface import ReplayCamera
 from uwlts.hardware.grbl import GrblStage
-from uwlts.hardware.replay import ReplayCamera
 from uwlts.hardware.scan_plan import ScanPlan, load_plan
 from uwlts.model.calibration import Calibration
 from uwlts.model.sensor import Sensor

@@ -9,8 +9,7 @@ import pytest
 
 from uwlts.errors import HardwareError, ImageError, SetupError
 from uwlts.hardware.aravis import AravisCamera
-from uwlts.hardware.camera_interface import CameraDevice, FrameCheck, FrameCounts, FrameStatus
-from uwlts.hardware.replay import ReplayCamera
+from uwlts.hardware.camera_interface import CameraDevice, FrameCheck, FrameCounts, FrameStatus, ReplayCamera
 from uwlts.hardware.scanning import open_camera
 from uwlts.model.sensor import Sensor
 from uwlts.runtime import optional_library
