@@ -174,7 +174,7 @@ def answer_buttons(board: Board, press: Callable[[str], None]) -> Callable[[], N
 
     def refresh() -> None:
         request.set_text(board.request)
-        asked.set_visibility(bool(board.answers))
+        asked.set_visibility(bool(board.request))
 
     return refresh
 

@@ -115,7 +115,7 @@ class BoardScreen:
 
     def request(self, text: str) -> None:
         """Show what the operator should do."""
-        self._board.request, self._board.answers = text, ANSWERS
+        self._board.request = text
 
     def show(self, picture: Picture) -> None:
         """Show an image."""

@@ -457,7 +457,7 @@ class Instrument:
         try:
             recording = guide(plan, out, screen, resume=resume, overwrite=overwrite)
         finally:
-            self._screen, board.request, board.answers = None, "", ()
+            self._screen, board.request = None, ""
         for line in recording.missing:
             board.say(f"still missing: {line}; continue it for more images", "warning")
         board.phase("calibrating")

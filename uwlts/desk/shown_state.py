@@ -186,10 +186,10 @@ class Progress:
 class Board:
     """Content of the page; attributes are replaced, never changed in place, and `say` appends to the log.
 
-    ``request`` is what the operator should do, and ``answers`` are the labels of its buttons. ``coverage`` is a PNG of
-    the image area covered in a guided calibration. ``detail`` returns, for a cloud that is shown thinned, the points in
-    a box from low to high (3,) in mm, in the form of `point_table`. ``profile`` is that of the latest laser
-    image, if a calibration is chosen.
+    ``request`` is what the operator should do; its buttons are shown with it. ``coverage`` is a PNG of the image area
+    covered in a guided calibration. ``detail`` returns, for a cloud that is shown thinned, the points in a box from low
+    to high (3,) in mm, in the form of `point_table`. ``profile`` is that of the latest laser image, if a calibration is
+    chosen.
     """
 
     title: str
@@ -199,7 +199,6 @@ class Board:
     picture: Picture | None = None
     pictures: int = 0
     request: str = ""
-    answers: tuple[str, ...] = ()
     coverage: bytes | None = None
     cloud: ThinnedCloud = field(default_factory=ThinnedCloud)
     cloud_name: str = ""
