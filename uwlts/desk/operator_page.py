@@ -4,6 +4,7 @@ import asyncio
 import threading
 from collections.abc import Awaitable, Callable
 from contextlib import closing, suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from urllib.parse import quote
@@ -98,16 +99,18 @@ def serve_desk(
                 report("closed")
 
 
+@dataclass(eq=False)
 class _Desk:
     """State shared by all browsers: the folder, the instrument, the chosen plan and the opened cloud."""
 
-    def __init__(
-        self, folder: Path, board: Board, instrument: Instrument, plan_path: Path | None, plan: ScanPlan | None
-    ):
-        self.folder, self.board, self.instrument = folder, board, instrument
-        self.plan_path, self.plan = plan_path, plan
-        self.measuring = Measuring()
-        self.analyses = Analyses(folder, board, self._show_result)
+    folder: Path
+    board: Board
+    instrument: Instrument
+    plan_path: Path | None
+    plan: ScanPlan | None
+
+    def __post_init__(self) -> None:
+        self.measuring, self.analyses = Measuring(), Analyses(self.folder, self.board, self._show_result)
 
     def serve_files(self, server: DeskServer) -> None:
         """Add a route for the files of the folder; viewers may fetch reports only."""

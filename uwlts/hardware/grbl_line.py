@@ -25,7 +25,7 @@ except ImportError:
     termios = None  # Windows, where no stage can be used
 
 _NUMBER = r"-?\d+(?:\.\d+)?"
-_STATE = re.compile(r"(Idle|Run|Hold|Jog|Alarm|Door|Check|Home|Sleep)(?::(\d+))?")
+_STATE = re.compile(r"(Idle|Run|Hold|Jog|Alarm|Door|Check|Home|Sleep)(?::\d+)?")
 _COORDINATES = re.compile(rf"{_NUMBER}(?:,{_NUMBER})*")
 
 ReplyKind = Literal["ok", "error", "ALARM", "banner", "setting", "message", "garbage"]
@@ -66,7 +66,6 @@ class Status:
     """
 
     state: str
-    substate: int | None = None
     machine_mm: float | None = None
     work_mm: float | None = None
     offset_mm: float | None = None
@@ -94,7 +93,6 @@ def _parse_status(body: str) -> Status | None:
     x = {name: float(values.split(",")[0]) for name, values in numbers.items()}
     return Status(
         state=state[1],
-        substate=int(state[2]) if state[2] else None,
         machine_mm=x.get("MPos"),
         work_mm=x.get("WPos"),
         offset_mm=x.get("WCO"),

@@ -88,7 +88,7 @@ def sweeping(real: GrblController) -> Iterator[GrblStage]:
         (">G54G20:ok", Reply("message", text=">G54G20:ok")),
         (
             "<Hold:0|MPos:-5.000,1.000,0.000|Bf:15,128|FS:0,1000|Pn:XZ|WCO:1.500,0.000,0.000>",
-            Status("Hold", 0, machine_mm=-5.0, offset_mm=1.5, spindle=1000.0, pins="XZ"),
+            Status("Hold", machine_mm=-5.0, offset_mm=1.5, spindle=1000.0, pins="XZ"),
         ),
         ("<Idle|WPos:2.000,0.000,0.000|F:0>", Status("Idle", work_mm=2.0)),
     ],
@@ -495,6 +495,8 @@ def test_what_is_raised_on_the_way_brakes_the_stage_in_the_dark(real, sweeping):
     with pytest.raises(OSError, match="disk full"):
         sweeping.sweep(700.0, feed_mm_per_min=SWEEP, reported=report)
     assert wait_for(lambda: not real.state().laser_on and not real.state().moving, 0.3)
+    with pytest.raises(HardwareError, match="held"):
+        sweeping.move_to(20.0, feed_mm_per_min=SWEEP)
     assert sweeping.unlock() == pytest.approx(real.state().position_mm, abs=STEP_MM)
 
 
