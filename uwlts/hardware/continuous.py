@@ -43,29 +43,6 @@ _BUSY = 0.9  # largest fraction of the frame period that the exposure may take
 
 
 @dataclass(frozen=True)
-class FramePlaces:
-    """Assignment of positions to the frames of a continuous scan.
-
-    ``latency_std_s`` is the standard uncertainty of ``latency_s``, or None if the latency was given. ``scatter_s`` is
-    the residual standard deviation of the stage's reports about the fitted line, as a time. ``speeds_mm_per_s`` has one
-    value for each pass.
-    """
-
-    latency_s: float
-    latency_std_s: float | None
-    scatter_s: float
-    speeds_mm_per_s: tuple[float, ...]
-
-    def __str__(self) -> str:
-        known = "as given" if self.latency_std_s is None else f"measured, std {1e3 * self.latency_std_s:.3f} ms"
-        speeds = ", ".join(f"{speed:+.3f}" for speed in self.speeds_mm_per_s)
-        return (
-            f"latency of the stage {1e3 * self.latency_s:+.3f} ms ({known}); its reports scatter by "
-            f"{1e3 * self.scatter_s:.2f} ms; speed {speeds} mm/s"
-        )
-
-
-@dataclass(frozen=True)
 class ScanListeners:
     """Functions that a scan calls: ``report`` and ``warn`` with lines of text, ``progress`` as in `uwlts.scan`.
 
@@ -122,8 +99,11 @@ def record_continuously(
     exposure_ms: float,
     overwrite: bool,
     listeners: ScanListeners,
-) -> FramePlaces:
-    """Record the passes of a plan and assign positions to its frames; errors as `uwlts.desk.scan.scan`."""
+) -> str:
+    """Record the passes of a plan, assign positions to its frames, and return a line about latency and speed.
+
+    The errors are those of `uwlts.desk.scan.scan`.
+    """
     sensor, continuous, warn = header.sensor, plan.continuous, listeners.warn
     assert continuous is not None
     positions, passes = plan.stage.positions_mm(), plan_passes(plan, continuous, stage)
@@ -285,8 +265,8 @@ class _FrameReader:
         even: tuple[float, float],
         at_rest: tuple[float, int | None],
         warn: Callable[[str], None],
-    ) -> FramePlaces:
-        """Assign final positions to all frames, from lines fitted where the speed is constant.
+    ) -> str:
+        """Assign final positions to all frames, from lines fitted where the speed is constant; return a line of text.
 
         ``even`` is the range of positions in mm with constant speed, ``at_rest`` are position and encoder count before
         the travel. Raises HardwareError if no frame shows a stripe,
@@ -329,7 +309,11 @@ class _FrameReader:
         stage = stage + speed * latency_s
         reports = [(_time_of(each) - self._began_s, each.position_mm) for one in self._passes for each in one]
         self._writer.place(stage, speed, np.array(reports))
-        return FramePlaces(latency_s, std_s, max(scatters), tuple(speeds))
+        known = "as given" if std_s is None else f"measured, std {1e3 * std_s:.3f} ms"
+        return (
+            f"latency of the stage {1e3 * latency_s:+.3f} ms ({known}); its reports scatter by "
+            f"{1e3 * max(scatters):.2f} ms; speed {', '.join(f'{each:+.3f}' for each in speeds)} mm/s"
+        )
 
 
 def _time_of(report: StageReport) -> float:

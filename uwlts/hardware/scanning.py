@@ -136,7 +136,7 @@ def record_scan(
         plan_passes(plan, plan.continuous, stage)
         seen = ScanProgress()
         taking = begin(seen)
-        placed = record_continuously(
+        line = record_continuously(
             plan,
             out,
             camera=camera,
@@ -146,7 +146,7 @@ def record_scan(
             overwrite=overwrite,
             listeners=replace(listeners, counted=taking.count_stripe),
         )
-        report(f"{placed}")
+        report(line)
         return seen
     known_ms, before_s = read_unfinished(out, [multiple for _, multiple in plan.images()]) if resume else ({}, 0.0)
     seen = ScanProgress(exposure_ms=known_ms)
