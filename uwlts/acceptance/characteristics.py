@@ -57,23 +57,12 @@ _FACE_BAND = 0.25
 class MeasuredSurface(Generic[FitT]):
     """Surface fitted by least squares to the points of its region, without those that the rule leaves out.
 
-    Attributes
-    ----------
-    fit : Sphere or Plane
-        Fit to the kept points.
-    range_mm : float
-        Range of the distances of the kept points from the fit.
-    range_95_mm : float
-        Width of the narrowest band about the fit that contains 95 % of all points.
-    points : int
-        Number of points on the artefact.
-    rejected : int
-        Number of points that were left out: the farthest 0.3 %, rounded down.
+    All points are those of the artefact; the ``rejected`` ones are the farthest 0.3 %, rounded down.
     """
 
     fit: FitT
-    range_mm: float
-    range_95_mm: float
+    range_mm: float  # range of the distances of the kept points from the fit
+    range_95_mm: float  # width of the narrowest band about the fit that contains 95 % of all points
     points: int
     rejected: int
 

@@ -73,23 +73,42 @@ class Place(LitPlace):
     centre_px: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class Relief:
-    """A place whose image shows the stage's position: ``motion_px_per_mm`` (N,), NaN on lines without relief."""
+class SlipWatch:
+    """Search for the earliest laser image of a scan that shows the stage's position, and the stage's slip in it.
 
-    place: Place
-    motion_px_per_mm: np.ndarray
+    ``place`` is that image, or None if none has enough relief.
+    """
+
+    def __init__(self) -> None:
+        self.place: Place | None = None
+        self._motion_px_per_mm = np.empty(0)  # (N,), NaN on lines without relief
+        self._latest: list[Place] = []
+
+    def add(self, place: Place) -> None:
+        """Consider an image; the middle one of three has enough relief if its error is a third of `LARGEST_MM`."""
+        self._latest = [*self._latest[-2:], place]
+        if self.place is not None or len(self._latest) < 3:
+            return
+        before, here, after = self._latest
+        motion = (after.centre_px - before.centre_px) / (after.position_mm - before.position_mm)
+        bend = after.centre_px - 2 * here.centre_px + before.centre_px
+        with np.errstate(invalid="ignore"):
+            steep = (np.abs(motion) > _LEAST_RELIEF) & (np.abs(bend) < _LARGEST_BEND_PX)
+        # The bend has six times the variance of a centre, and a slip twice that variance.
+        if steep.sum() >= _FEWEST_LINES and _standard_error(bend[steep] / np.sqrt(3), motion[steep]) <= LARGEST_MM / 3:
+            self.place, self._motion_px_per_mm = here, np.where(steep, motion, np.nan)
 
     def measure_slip(self, again: np.ndarray) -> tuple[float, float]:
         """Return the stage's displacement in mm from new centres (N,) in px at this place, and its standard error.
 
         Both are infinite if too few lines remain.
         """
+        assert self.place is not None
         away = again - self.place.centre_px
-        good = np.isfinite(away) & np.isfinite(self.motion_px_per_mm)
+        good = np.isfinite(away) & np.isfinite(self._motion_px_per_mm)
         if good.sum() < _FEWEST_LINES:
             return np.inf, np.inf
-        motion, away = self.motion_px_per_mm[good], away[good]
+        motion, away = self._motion_px_per_mm[good], away[good]
         # The weighted median is robust to lines that now show another stripe.
         slips, weights = away / motion, np.abs(motion)
         order = np.argsort(slips)
@@ -98,39 +117,13 @@ class Relief:
         return slip_mm, _standard_error(away - slip_mm * motion, motion)
 
     def is_significant(self, slip_mm: float, error_mm: float) -> bool:
-        """Return whether the slip exceeds `LARGEST_MM` and its uncertainty."""
+        """Return whether a slip exceeds `LARGEST_MM` and its uncertainty."""
         return np.isfinite(slip_mm) and abs(slip_mm) > max(LARGEST_MM, _SIGMAS * error_mm)
-
-
-class SlipWatch:
-    """Search for the earliest laser image of a scan with enough ``relief`` to determine the stage's position."""
-
-    def __init__(self) -> None:
-        self.relief: Relief | None = None
-        self._latest: list[Place] = []
-
-    def add(self, place: Place) -> None:
-        """Consider an image."""
-        self._latest = [*self._latest[-2:], place]
-        if self.relief is None and len(self._latest) == 3:
-            self.relief = _measure_relief(*self._latest)
 
 
 def select_centres(stripe: Stripe) -> np.ndarray:
     """Return the centres (N,) in px of the lines with one stripe, NaN on the others."""
     return np.where(stripe.status == StripeStatus.OK, stripe.centre_px, np.nan)
-
-
-def _measure_relief(before: Place, here: Place, after: Place) -> Relief | None:
-    """Measure the relief of the middle place; None if its uncertainty exceeds a third of `LARGEST_MM`."""
-    motion = (after.centre_px - before.centre_px) / (after.position_mm - before.position_mm)
-    bend = after.centre_px - 2 * here.centre_px + before.centre_px
-    with np.errstate(invalid="ignore"):
-        steep = (np.abs(motion) > _LEAST_RELIEF) & (np.abs(bend) < _LARGEST_BEND_PX)
-    # The bend has six times the variance of a centre, and a slip twice that variance.
-    if steep.sum() < _FEWEST_LINES or _standard_error(bend[steep] / np.sqrt(3), motion[steep]) > LARGEST_MM / 3:
-        return None
-    return Relief(here, np.where(steep, motion, np.nan))
 
 
 def _standard_error(scatter_px: np.ndarray, motion_px_per_mm: np.ndarray) -> float:

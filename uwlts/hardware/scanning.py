@@ -362,16 +362,15 @@ class _Taking:
 
     def check_steps(self) -> None:
         """Revisit an early place with relief, if any; raises HardwareError if the stage is displaced."""
-        if (relief := self._slip.relief) is None:
+        if (place := self._slip.place) is None:
             return
-        place = relief.place
         self._rig.move_to(place.position_mm)
         image = self._rig.frame("laser", place.exposure_ms).seen
         unlit = self._rig.image("lamp", place.exposure_ms)[0] if self._plan.background else None
-        slip_mm, error_mm = relief.measure_slip(select_centres(get_stripe(image, self._sensor, background=unlit)))
+        slip_mm, error_mm = self._slip.measure_slip(select_centres(get_stripe(image, self._sensor, background=unlit)))
         if not np.isfinite(slip_mm):
             seen = "shows no stripe at its earlier place; or the laser has failed since the last image"
-        elif relief.is_significant(slip_mm, error_mm):
+        elif self._slip.is_significant(slip_mm, error_mm):
             seen = f"shows a displacement of the stage of {slip_mm:+.2f} mm (std {error_mm:.2f} mm)"
         else:
             return
