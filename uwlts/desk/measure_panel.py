@@ -136,30 +136,6 @@ def _text(x: float, y: float, text: str, anchor: str) -> str:
     return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" {style}>{escape(text)}</text>'
 
 
-class PlotView:
-    """Plot in one browser; ``picked`` is called with the horizontal coordinate of a click."""
-
-    def __init__(self, picked: Callable[[float], None]):
-        self._picked = picked
-        self._plot: Plot | None = None
-        # The content is made by `Plot.draw`, which escapes texts.
-        self._image = ui.interactive_image(size=(_WIDTH, _HEIGHT), on_mouse=self._click, sanitize=False)
-        self._image.classes("plot w-full").props('role="img"')
-        self._image.set_visibility(False)
-
-    def show(self, plot: Plot | None) -> None:
-        """Show a plot, or nothing."""
-        self._plot = plot
-        self._image.set_visibility(plot is not None)
-        if plot is not None:
-            self._image.props(f'aria-label="{escape(plot.up_label)} over {escape(plot.across_label)}"')
-            self._image.set_content(plot.draw())
-
-    def _click(self, event: MouseEventArguments) -> None:
-        if self._plot is not None:
-            self._picked(self._plot.place_of(event.image_x))
-
-
 _BINS = 60  # of the displayed histogram
 _DEFAULT_RADIUS_MM, _DEFAULT_WIDTH_MM = 15.0, 2.0
 _GROWING = "points of a running scan have no uncertainty: reconstruct it"
@@ -202,6 +178,7 @@ class MeasurePanel:
         self._rows: dict[int, _Row] = {}
         self._shown: MeasuredValues | None = None
         self._tool: Tool = "distance"
+        self._plot: Plot | None = None
 
     def build(self) -> None:
         """Build the tab."""
@@ -222,7 +199,9 @@ class MeasurePanel:
             self._width = NumberField("width, mm", value=_DEFAULT_WIDTH_MM, min=0.001)
             self._field = ui.select(["Z", "intensity", "deviation"], value="Z", label="field")
             self._button("histogram", self._show_histogram).props("outline dense")
-        self._plot = PlotView(self._pick_along)
+        # The content is made by `Plot.draw`, which escapes texts.
+        self._image = ui.interactive_image(size=(_WIDTH, _HEIGHT), on_mouse=self._pick_along, sanitize=False)
+        self._image.classes("plot w-full").props('role="img"').set_visibility(False)
         self._caption = ui.label().classes("text-sm font-mono")
         with ui.row().classes("gap-2") as self._in_section:
             for tool in get_args(Tool):
@@ -313,11 +292,16 @@ class MeasurePanel:
         self._live, self._section, self._places_mm, self._without = True, None, [], _LIVE_WITHOUT
         self.refresh()
 
-    def _pick_along(self, along_mm: float) -> None:
-        if self._section is None:
-            return
-        self._places_mm = [*self._places_mm, along_mm][-2:]
-        self._show_section()
+    def _pick_along(self, event: MouseEventArguments) -> None:
+        if self._section is not None and self._plot is not None:
+            self._places_mm = [*self._places_mm, self._plot.place_of(event.image_x)][-2:]
+            self._show_section()
+
+    def _draw(self, plot: Plot) -> None:
+        self._plot = plot
+        self._image.set_visibility(True)
+        self._image.props(f'aria-label="{escape(plot.up_label)} over {escape(plot.across_label)}"')
+        self._image.set_content(plot.draw())
 
     def _choose_tool(self, tool: Tool) -> None:
         self._tool = tool
@@ -342,7 +326,7 @@ class MeasurePanel:
             self._source = f"profile at X {section.cloud.points_mm[0, 0]:.3f} mm"
         nearest = [section.find_nearest(place) for place in self._places_mm]
         along, depth = section.along_mm, section.depth_mm
-        self._plot.show(
+        self._draw(
             Plot(
                 along,
                 depth,
@@ -371,7 +355,7 @@ class MeasurePanel:
         width = float(edges[1] - edges[0])
         self._live, self._section = False, None
         self._in_section.set_visibility(False)
-        self._plot.show(Plot(edges[:-1] + width / 2, counts, f"{name} / {unit}", "points", bar_width=width))
+        self._draw(Plot(edges[:-1] + width / 2, counts, f"{name} / {unit}", "points", bar_width=width))
         self._caption.set_text(
             f"{name}: mean {values.mean():.4f}, standard deviation {values.std():.4f} {unit}, {len(values):,} points"
         )

@@ -47,20 +47,6 @@ def _nicegui() -> FastAPI:
     return app
 
 
-class _FirstError(logging.Handler):
-    """Keep the last line of the first error that the server logs; no other handler gets any."""
-
-    def __init__(self):
-        super().__init__(logging.ERROR)
-        self.text = ""
-        log = logging.getLogger("uvicorn.error")
-        log.handlers, log.propagate = [self], False
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Keep an error."""
-        self.text = self.text or record.getMessage().strip().rpartition("\n")[2]
-
-
 class DeskServer:
     """Server of a page that shows a board, from construction until the ``with`` ends. Only one at a time.
 
@@ -129,7 +115,11 @@ class DeskServer:
                 )
             self._open = True
             nicegui.state.show = show
-            errors = _FirstError()
+            errors: list[str] = []
+            log = logging.getLogger("uvicorn.error")
+            # Nothing is printed, and the first error is kept.
+            log.handlers, log.propagate = [logging.NullHandler()], False
+            log.filters = [lambda record: bool(errors or errors.append(record.getMessage()))]
             config = uvicorn.Config(
                 GuardedApp(self.app, self._access, laser_port=None if switch is None else switch.port),
                 http="h11",
@@ -147,7 +137,8 @@ class DeskServer:
             deadline = time.monotonic() + _START_S
             while not self._server.started:
                 if time.monotonic() > deadline or not self._thread.is_alive():
-                    raise SetupError(f"the page's server did not start: {errors.text or 'no reason is known'}")
+                    why = errors[0].strip().rpartition("\n")[2] if errors else "no reason is known"
+                    raise SetupError(f"the page's server did not start: {why}")
                 time.sleep(0.02)
         except BaseException:
             if switch is not None:
