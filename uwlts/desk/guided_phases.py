@@ -125,12 +125,21 @@ class Session:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Target found in a lamp image (H, W), or None, with the reasons that make it unusable."""
+    """Target found in a lamp image (H, W), or None, with the reasons that make it unusable.
+
+    An accepted one has the ``pose`` to be recorded, and the calibration ``state`` that includes it. ``lamp_ms`` is the
+    exposure of the image. ``laser`` is the image (H, W) with the laser line and its exposure in ms, if the line was on
+    the target.
+    """
 
     image: np.ndarray
     view: TargetView | None
     quality: TargetQuality | None
     reasons: tuple[str, ...]
+    pose: RecordedPose | None = None
+    state: State | None = None
+    lamp_ms: float = 0.0
+    laser: tuple[np.ndarray, float] | None = None
 
     @property
     def usable(self) -> TargetView | None:
@@ -138,26 +147,9 @@ class Found:
         return None if self.reasons else self.view
 
     def line(self) -> str:
-        """Return the reasons as a line of text."""
-        return f"refused: {'; '.join(self.reasons)}"
-
-
-@dataclass(frozen=True, eq=False)
-class Accepted(Found):
-    """A pose to be recorded, and the calibration ``state`` that includes it.
-
-    ``lamp_ms`` is the exposure of the image. ``laser`` is the image (H, W) with the laser line and its exposure in ms,
-    if the line was on the target.
-    """
-
-    quality: TargetQuality
-    pose: RecordedPose
-    lamp_ms: float
-    laser: tuple[np.ndarray, float] | None
-    state: State
-
-    def line(self) -> str:
-        """Return the quality as a line of text."""
+        """Return the quality of an accepted pose, or the reasons against it, as a line of text."""
+        if self.quality is None or self.pose is None or self.state is None:
+            return f"refused: {'; '.join(self.reasons)}"
         quality, state = self.quality, self.state
         stripe = f"stripe on {len(self.pose.stripe)} lines" if self.laser else "no stripe on the target"
         residual = "not yet" if state.solution is None else f"{state.solution.image_rms_px()[-1]:.2f} px"
@@ -215,12 +207,11 @@ class TargetPhase:
         return poses
 
     def _attempt(self, before: State, stage_mm: float) -> Found:
-        """Try to take the target as the next pose after those of ``before``; return `Accepted`, or the reasons."""
+        """Try to take the target as the next pose after those of ``before``; return it accepted, or with reasons."""
         session = self._session
         lamp, lamp_ms = session.take("lamp")
         found = self.find(lamp)
-        view, quality = found.usable, found.quality
-        if view is None or quality is None:
+        if (view := found.usable) is None:
             return found
         if reasons := self._judge_novelty(view, [p.view for p in before.recorded]):
             return replace(found, reasons=reasons)
@@ -245,7 +236,7 @@ class TargetPhase:
             reasons = (f"contradicts the others: with it {state.undetermined}",)
         if reasons:
             return replace(found, reasons=reasons)
-        return Accepted(lamp, view, quality, (), pose, lamp_ms, laser if shown else None, state)
+        return replace(found, pose=pose, state=state, lamp_ms=lamp_ms, laser=laser if shown else None)
 
     def _judge_novelty(self, view: TargetView, recorded: list[TargetView]) -> tuple[str, ...]:
         # The stage's steps may be small: its position distinguishes the poses.
@@ -306,7 +297,7 @@ class TargetPhase:
             found = self._attempt(state, _NUMBER_MM * (last + 1))
             state = self._record_accepted(found, state, f"image {len(state.recorded) + 1}")
             still, since_s = None, time.monotonic()
-            if isinstance(found, Accepted):
+            if found.pose is not None:
                 advice, skipped = None, 0
             else:
                 refused = [] if found.view is None else [found.view]
@@ -350,7 +341,7 @@ class TargetPhase:
     def _record_accepted(self, found: Found, state: State, name: str) -> State:
         """Record an accepted pose, report the result, and return the state after it."""
         stripe = None
-        if isinstance(found, Accepted):
+        if found.pose is not None and found.state is not None:
             state, stripe, stage_mm = found.state, found.pose.stripe, found.pose.stage_mm
             self._session.record(found.image, found.lamp_ms, stage_mm=stage_mm, laser_on=False)
             if found.laser is not None:
