@@ -17,13 +17,13 @@ from uwlts.acceptance.characteristics import (
     RULES,
     Characteristic,
     CharacteristicValue,
-    StoredPart,
     describe_missing,
     judge_characteristic,
     measure_position,
 )
 from uwlts.argument_types import check_arguments
 from uwlts.errors import DescriptionError, Error
+from uwlts.evaluation.figures import StoredResult
 from uwlts.files.json_files import EDITED, read_model, to_canonical_json, write_model
 from uwlts.files.reading import is_regular_file
 from uwlts.files.writing import hash_file
@@ -50,7 +50,7 @@ _TURNED_DEG = 10.0
 """Angle from which directions differ; seven directions of a bar are at least 30 deg apart if they are spread evenly."""
 
 
-class Requirement(StoredPart):
+class Requirement(StoredResult):
     """Requirement of the guideline: its clause, what is demanded, what was done, and whether that meets it."""
 
     clause: str
@@ -135,7 +135,7 @@ State = Literal["missing", "failed", "judged"]
 Verdict = Literal["nonconformity proven", "rejected", "undecided", "accepted", "conformity proven"]
 
 
-class JudgedPosition(StoredPart):
+class JudgedPosition(StoredResult):
     """Position of the plan: whether its file is missing, could not be evaluated (with the reason), or is judged.
 
     ``inputs`` is the digest of file, calibration and artefact; a later run takes the values of an unchanged position
@@ -158,7 +158,7 @@ class JudgedPosition(StoredPart):
     values: tuple[CharacteristicValue, ...] = ()
 
 
-class Acceptance(Brief, StoredPart):
+class Acceptance(Brief, StoredResult):
     """Result of `accept`, and the content of its file.
 
     Attributes

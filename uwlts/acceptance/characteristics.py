@@ -14,7 +14,7 @@ from functools import partial
 from typing import Annotated, Generic, Literal, get_args
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from scipy.spatial import KDTree
 from scipy.special import ndtr
 
@@ -38,7 +38,7 @@ from uwlts.evaluation.artefact_figures import (
     evaluate_step,
     measure_step,
 )
-from uwlts.evaluation.figures import TOWARDS_SENSOR, Verdict, judge_interval, spread_mm
+from uwlts.evaluation.figures import TOWARDS_SENSOR, StoredResult, Verdict, judge_interval, spread_mm
 from uwlts.fitting.least_squares import VDI_OUTLIER_SHARE, FitT, principal_axes
 from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard, StepStandard
 from uwlts.model.sensor import UnitVector
@@ -180,13 +180,7 @@ _DECISIONS: dict[Verdict, tuple[Decision, Decision]] = {
 """Decision with a guard band, and that of simple acceptance."""
 
 
-class StoredPart(BaseModel):
-    """Part of a stored result; fields of newer versions are kept."""
-
-    model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False)
-
-
-class CharacteristicValue(StoredPart):
+class CharacteristicValue(StoredResult):
     """Measured value of a characteristic at one position.
 
     Attributes
@@ -220,7 +214,7 @@ class CharacteristicValue(StoredPart):
     extent_mm: tuple[Spread, Spread] | None = None
 
 
-class Characteristic(StoredPart):
+class Characteristic(StoredResult):
     """Characteristic with its worst value, the maximum permissible error, and the decision.
 
     Attributes
