@@ -95,12 +95,13 @@ class Session:
         """Take an image (H, W) in a light; return it with its exposure in ms."""
         if light not in self._exposure_ms:
             self.settle(light)
-        image, exposure_ms = self.rig.image(light, self._exposure_ms.get(light, START_MS))
-        return image.astype(self._dtype, copy=False), exposure_ms
+        asked_ms = self._exposure_ms.get(light, START_MS)
+        frame = self.rig.frame(light, asked_ms)
+        return frame.image.astype(self._dtype, copy=False), asked_ms if frame.exposure_ms is None else frame.exposure_ms
 
     def take_unlit(self) -> np.ndarray:
         """Take a short image (H, W) without laser, in the ambient light."""
-        return self.rig.image("lamp", START_MS)[0]
+        return self.rig.frame("lamp", START_MS).image
 
     def settle(self, light: Light) -> bool:
         """Find the exposure for the present scene; return False if it is planned, or the scene is too dark."""

@@ -263,7 +263,7 @@ class _Taking:
         """Shorten the exposure of a light if it is too long here; find it if nothing was seen in this light before."""
         exposures = self._seen.exposure_ms
         if light in exposures:
-            here = measure_brightness(self._rig.image(light, exposures[light])[0], self._sensor, light)
+            here = measure_brightness(self._rig.frame(light, exposures[light]).image, self._sensor, light)
             if here.level <= self._sensor.exposure.auto_level:
                 return
         exposure_ms = self._rig.find_exposure(light, start_ms=exposures.get(light, START_MS))
@@ -271,7 +271,7 @@ class _Taking:
             return
         if light == "laser":
             # Daylight on an object's edges can look like a stripe at long exposures.
-            lit, unlit = (self._rig.image(each, exposure_ms)[0] for each in ("laser", "lamp"))
+            lit, unlit = (self._rig.frame(each, exposure_ms).image for each in ("laser", "lamp"))
             if not self._shows_laser(lit, unlit):
                 return
             self._lit = LitPlace(position_mm, exposure_ms)
@@ -297,7 +297,7 @@ class _Taking:
             frame = rig.frame(light, asked_ms)
             bright = measure_brightness(frame.seen, self._sensor, light)
         image, exposure_ms = frame.seen, asked_ms if frame.exposure_ms is None else frame.exposure_ms
-        unlit = rig.image("lamp", exposure_ms)[0] if zero_dn and light == "laser" else None
+        unlit = rig.frame("lamp", exposure_ms).image if zero_dn and light == "laser" else None
         if light == "laser" and multiple == 1:
             stripe, place = get_stripe(image, self._sensor, background=unlit), LitPlace(position_mm, exposure_ms)
             self._slip.add(Place(position, exposure_ms, select_centres(stripe)))
@@ -366,7 +366,7 @@ class _Taking:
             return
         self._rig.move_to(place.position_mm)
         image = self._rig.frame("laser", place.exposure_ms).seen
-        unlit = self._rig.image("lamp", place.exposure_ms)[0] if self._plan.background else None
+        unlit = self._rig.frame("lamp", place.exposure_ms).image if self._plan.background else None
         slip_mm, error_mm = self._slip.measure_slip(select_centres(get_stripe(image, self._sensor, background=unlit)))
         if not np.isfinite(slip_mm):
             seen = "shows no stripe at its earlier place; or the laser has failed since the last image"
