@@ -90,9 +90,7 @@ def main(*options: Annotated[str, Parameter(allow_leading_hyphen=True)]) -> None
             usual = recorder._compare_clocks
             for speed in SPEEDS_MM_S:
                 for shift in SHIFTS_S:
-                    recorder._compare_clocks = lambda *about, by=shift: recorder._Clock(
-                        (found := usual(*about)).offset_s + by, found.encoder
-                    )
+                    recorder._compare_clocks = lambda *about, by=shift: ((found := usual(*about))[0] + by, found[1])
                     said_by: list[str] = []
                     moving = f"{{ speed_mm_per_s = {speed} }}"
                     uwlts.scan(

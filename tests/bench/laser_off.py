@@ -49,7 +49,7 @@ try:
     with GrblStage(plan.stage.port) as stage, open_camera(plan.camera) as camera:
         rig = Rig(plan, plan.stage, plan.described_sensor(), camera, stage, ahead=1.0)
         rig.frame("laser", {EXPOSURE_MS})
-        print(stage._line._guard.pid, flush=True)
+        print(stage._guard.pid, flush=True)
         sys.stdin.readline()
         while True:
             rig.frame("laser", {EXPOSURE_MS})

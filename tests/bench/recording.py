@@ -7,7 +7,7 @@ import multiprocessing.synchronize
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +15,7 @@ import numpy as np
 from twin.devices.gige_camera import ExposedFrame, GigeCamera
 from uwlts.desk.recording_view import LOOK_S, RecordingView, follow_frames
 from uwlts.desk.shown_state import Board
-from uwlts.hardware.camera_interface import CameraDevice
-from uwlts.hardware.replay import ReplayCamera
+from uwlts.hardware.camera_interface import CameraDevice, CameraSettings, Delivered, ReplayCamera
 from uwlts.hardware.scanning import open_camera
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor
@@ -25,6 +24,7 @@ from uwlts.storage.capture import CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
 
 SHOWN, TAKEN, RATE_HZ = 50, 1000, 60.0
+BUFFERS = 32  # as in the library of cameras
 # Through a cable of 1 Gbit/s, which takes 11 ms for a frame.
 SERVED = 300
 
@@ -46,6 +46,23 @@ class Recorded:
     behind_s: float = 0.0
 
 
+class PacedReplay(ReplayCamera):
+    """Replay without end at the rate `RATE_HZ`; images beyond the buffers of a camera are lost."""
+
+    def _configure(self, wanted: CameraSettings) -> CameraSettings:
+        self._began_s, self._due = time.monotonic(), 0
+        return super()._configure(wanted)
+
+    def _next(self, timeout_s: float) -> Delivered | None:
+        self._due = max(self._due, int((time.monotonic() - self._began_s) * RATE_HZ) - BUFFERS)
+        wait_s = self._began_s + self._due / RATE_HZ - time.monotonic()
+        time.sleep(min(max(wait_s, 0.0), timeout_s))
+        if wait_s > timeout_s:
+            return None
+        self._due += 1
+        return replace(self._deliver(self._due % SHOWN), frame_id=self._due)
+
+
 def recording(*, live: bool = False) -> Recorded:
     """Record from a camera with 60 frames per second, which repeats a capture of frames with a stripe and noise.
 
@@ -57,7 +74,7 @@ def recording(*, live: bool = False) -> Recorded:
         with CaptureWriter(source, _header(sensor), dtype=np.uint8) as writer:
             for k, image in enumerate(_images(sensor)):
                 writer.append(Frame(image, float(k), True, 1.0, float(k)))
-        with ReplayCamera(source, repeat=True) as camera:
+        with PacedReplay(source) as camera:
             if live:
                 return _followed(out, lambda: _record(camera, sensor, out, TAKEN))
             return _record(camera, sensor, out, TAKEN)

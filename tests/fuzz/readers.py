@@ -37,8 +37,8 @@ from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.mount.calibrate_mount import calibrate_mount
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.comparison.change_reference import read_datums, read_reference, read_shape
+from uwlts.desk.guided_plan import load_guided_plan
 from uwlts.evaluation.evaluate import read_evaluation
-from uwlts.hardware.guided.guided_plan import load_guided_plan
 from uwlts.hardware.scan_plan import load_plan
 from uwlts.model.artefacts import read_artefact
 from uwlts.model.library import library_folder, load_sensor

@@ -3,7 +3,7 @@
 import resource
 import sys
 
-from uwlts.desk.guided import BoardScreen
+from uwlts.desk.guided_screen import BoardScreen
 from uwlts.desk.server import DeskServer
 from uwlts.desk.shown_state import Board
 from uwlts.hardware.grbl import GrblStage

@@ -20,8 +20,8 @@ from twin.devices.grbl_controller import GrblController
 from twin.devices.serve import ServedTwin, serve
 from twin.scene.description import load_scene
 from uwlts.calibration.sequential.sequential_calibration import calibrate_sequentially
+from uwlts.desk.guided_plan import load_guided_plan
 from uwlts.errors import DescriptionError
-from uwlts.hardware.guided.guided_plan import load_guided_plan
 from uwlts.model.library import load_sensor
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Sensor

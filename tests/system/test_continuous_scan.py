@@ -99,7 +99,7 @@ def test_frames_are_where_the_stage_was_whatever_the_clocks_differ_by(hill, tmp_
 
     def compared(*about):
         clock = usual(*about)
-        return continuous._Clock(clock.offset_s + 0.02, clock.encoder)
+        return clock[0] + 0.02, clock[1]
 
     monkeypatch.setattr(continuous, "_compare_clocks", compared)
     moving = f"speed_mm_per_s = {SPEED}"

@@ -13,7 +13,7 @@ import pytest
 from twin.devices.gige_camera import PORT, GigeCamera
 from uwlts.errors import HardwareError
 from uwlts.hardware.aravis import list_aravis_cameras
-from uwlts.hardware.camera_interface import FrameStatus, Region
+from uwlts.hardware.camera_interface import FrameStatus
 from uwlts.hardware.scanning import open_camera
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture, CaptureHeader, Frame
@@ -66,7 +66,7 @@ def test_the_camera_says_who_it_is_and_what_it_set(camera):
     # The camera counts whole microseconds, of the exposure and of the period.
     assert settings.exposure_ms == pytest.approx(1.2344, abs=1e-3) and settings.exposure_ms != 1.2344
     assert settings.frame_rate_hz == pytest.approx(30, rel=1e-6 * 30)
-    assert settings.region == Region(0, 0, WIDTH, HEIGHT)
+    assert settings.rows == HEIGHT
     assert settings.gain_db is None
     assert camera.configure(exposure_ms=1e9).exposure_ms == pytest.approx(1e4)
 
@@ -76,8 +76,6 @@ def test_what_the_camera_cannot_do_is_an_error(camera):
         camera.configure(gain_db=6)
     with pytest.raises(HardwareError, match="does not offer Mono12, only .*Mono8"):
         camera.configure(bits=12)
-    with pytest.raises(HardwareError, match="not within the image sensor of 1280 x 1024"):
-        camera.configure(region=Region(1000, 0, 281, 10))
 
 
 def test_it_is_found_by_its_serial_number_and_identifier(served):
@@ -122,13 +120,12 @@ def test_every_trigger_gives_one_frame_of_its_moment(scene, camera):
     assert camera.counts.ok == 5 and camera.counts.unanswered == 1
 
 
-def test_a_region_is_cut_out_of_the_image_and_binning_is_switched_off(scene, camera, caplog):
-    region = Region(600, 500, 64, 32)
+def test_binning_is_switched_off(scene, camera, caplog):
     camera._call("set_integer", b"BinningHorizontal", 2)
-    assert camera.configure(region=region, trigger="software").region == region
+    camera.configure(trigger="software")
     camera.start()
     camera.trigger()
-    assert np.array_equal(camera.grab(WAIT_S).image, scene.frame(0.0)[500:532, 600:664])
+    assert np.array_equal(camera.grab(WAIT_S).image[1:], scene.frame(0.0)[1:])
     assert "BinningHorizontal was 2 and is now 1" in caplog.text
 
 

@@ -62,7 +62,7 @@ class Camera(CameraDevice):
     def _trigger(self):
         self.lit = Stage.opened.laser_power > 0
         if self.lit:
-            print("lit", Stage.opened._line._guard.pid, flush=True)
+            print("lit", Stage.opened._guard.pid, flush=True)
         if self.lit and hangs == "trigger":
             time.sleep(60)
         self.due_s = time.monotonic() + 1e-3 * self.settings.exposure_ms

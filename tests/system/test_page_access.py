@@ -26,7 +26,8 @@ from websockets.sync.client import ClientConnection, connect
 from tests.waiting import within
 from uwlts.desk.access import MOST_VIEWERS, PageAccess
 from uwlts.desk.board_page import BoardView, update_regularly
-from uwlts.desk.guided import BoardScreen, answer_buttons
+from uwlts.desk.guided import answer_buttons
+from uwlts.desk.guided_screen import BoardScreen
 from uwlts.desk.server import DeskServer
 from uwlts.desk.shown_state import Board, Picture
 from uwlts.errors import SetupError

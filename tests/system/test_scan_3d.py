@@ -17,8 +17,7 @@ from twin.scene.description import Scene
 from twin.sensor.detector import INVALID, PeakFinder
 from uwlts.errors import DescriptionError, HardwareError
 from uwlts.hardware import aravis
-from uwlts.hardware.camera_interface import Region
-from uwlts.hardware.replay import ReplayCamera
+from uwlts.hardware.camera_interface import ReplayCamera
 from uwlts.hardware.scanning import open_camera
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor
@@ -106,7 +105,7 @@ def counting() -> Iterator[Counting]:
 def test_each_profile_of_a_frame_has_its_own_count_and_time(counting):
     with open_camera("gige:127.0.0.1") as camera:
         settings = camera.configure(exposure_ms=0.1, frame_rate_hz=200.0, profiles=ROWS)
-        assert settings.region == Region(0, 0, 96, ROWS) and settings.frame_rate_hz == pytest.approx(200.0)
+        assert settings.rows == ROWS and settings.frame_rate_hz == pytest.approx(200.0)
         camera.start(faults="skip")
         grabbed = [camera.grab(5.0) for _ in range(3 * ROWS)]
         counting.served.inject("drop")

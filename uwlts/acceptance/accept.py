@@ -1,7 +1,8 @@
 """Acceptance test of a sensor by artefacts in stated positions, demands of VDI/VDE 2634 part 2, and its result file."""
 
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
@@ -16,13 +17,13 @@ from uwlts.acceptance.characteristics import (
     RULES,
     Characteristic,
     CharacteristicValue,
-    StoredPart,
     describe_missing,
     judge_characteristic,
     measure_position,
 )
 from uwlts.argument_types import check_arguments
 from uwlts.errors import DescriptionError, Error
+from uwlts.evaluation.figures import StoredResult
 from uwlts.files.json_files import EDITED, read_model, to_canonical_json, write_model
 from uwlts.files.reading import is_regular_file
 from uwlts.files.writing import hash_file
@@ -49,7 +50,7 @@ _TURNED_DEG = 10.0
 """Angle from which directions differ; seven directions of a bar are at least 30 deg apart if they are spread evenly."""
 
 
-class Requirement(StoredPart):
+class Requirement(StoredResult):
     """Requirement of the guideline: its clause, what is demanded, what was done, and whether that meets it."""
 
     clause: str
@@ -66,47 +67,37 @@ def check_requirements(
     standards = [each.standard for each in plan.artefacts.values()]
     spheres = [each for each in standards if isinstance(each, SphereStandard)]
     low, high = (share * diagonal for share in _DIAMETERS)
-    rows = [_count("probing error: positions", _PROBED, plan, values, "PF", lambda each: len(each.diameters_mm))]
-    rows += _sizes(
-        f"probing error: diameter of the spheres, {_DIAMETERS[0]:g} to {_DIAMETERS[1]:g} L0",
-        [size for each in spheres for size in each.diameters_mm],
-        low,
-        high,
-    )
-    rows += [_count("sphere spacing: positions", _SPACED, plan, values, "SD", lambda each: len(each.spacings_mm))]
-    spacings = [size for each in spheres for size in each.spacings_mm]
-    rows += _sizes(f"sphere spacing: length, {_SPACING:g} L0", spacings, _SPACING * diagonal, np.inf)
-    rows += [_count("flatness: positions", _FLAT, plan, values, "F", lambda _: 0)]
     extents = [each.extent_mm for each in values if each.symbol == "F" and each.extent_mm is not None]
-    lengths, widths = [length for length, _ in extents], [width for _, width in extents]
-    rows += _sizes(f"flatness: measured length, {_PLANE:g} L0", lengths, _PLANE * diagonal, np.inf)
-    rows += _sizes("flatness: measured width", widths, _WIDTH_MM, np.inf)
+    planned = Counter[Symbol]()
+    for position in plan.positions:
+        standard = plan.artefacts[position.artefact].standard
+        if isinstance(standard, SphereStandard):
+            planned.update(PF=len(standard.diameters_mm), SD=len(standard.spacings_mm))
+        planned["F"] += isinstance(standard, PlaneStandard)
+
+    def count(clause: str, least: int, symbol: Symbol) -> Requirement:
+        own = [each for each in values if each.symbol == symbol]
+        different = count_different(own, diagonal)
+        done = f"{len(own)} of {planned[symbol]} planned" + (f", {different} differ" if different < len(own) else "")
+        return Requirement(clause=clause, required=f"at least {least}", done=done, met=different >= least)
+
+    diameters = [size for each in spheres for size in each.diameters_mm]
+    spacings = [size for each in spheres for size in each.spacings_mm]
+    wanted = f"{_DIAMETERS[0]:g} to {_DIAMETERS[1]:g} L0"
+    rows = [
+        count("probing error: positions", _PROBED, "PF"),
+        *_sizes(f"probing error: diameter of the spheres, {wanted}", diameters, low, high),
+        count("sphere spacing: positions", _SPACED, "SD"),
+        *_sizes(f"sphere spacing: length, {_SPACING:g} L0", spacings, _SPACING * diagonal, np.inf),
+        count("flatness: positions", _FLAT, "F"),
+        *_sizes(f"flatness: measured length, {_PLANE:g} L0", [each[0] for each in extents], _PLANE * diagonal, np.inf),
+        *_sizes("flatness: measured width", [each[1] for each in extents], _WIDTH_MM, np.inf),
+    ]
     if shares := list(rejected_shares):
         largest = max(shares)
         most, met = f"at most {100 * VDI_OUTLIER_SHARE:g} %", largest <= VDI_OUTLIER_SHARE
         rows.append(Requirement(clause="points left out", required=most, done=f"{100 * largest:.2f} %", met=met))
     return tuple(rows)
-
-
-def _count(
-    clause: str,
-    least: int,
-    plan: AcceptancePlan,
-    values: list[CharacteristicValue],
-    symbol: Symbol,
-    count_of: Callable[[SphereStandard], int],
-) -> Requirement:
-    """Compare the number of different positions with the least one."""
-    own = [each for each in values if each.symbol == symbol]
-    planned = 0
-    for position in plan.positions:
-        standard = plan.artefacts[position.artefact].standard
-        if isinstance(standard, SphereStandard):
-            planned += count_of(standard)
-        planned += isinstance(standard, PlaneStandard) and symbol == "F"
-    different = count_different(own, plan.diagonal_mm())
-    done = f"{len(own)} of {planned} planned" + (f", {different} differ" if different < len(own) else "")
-    return Requirement(clause=clause, required=f"at least {least}", done=done, met=different >= least)
 
 
 def count_different(values: list[CharacteristicValue], diagonal_mm: float) -> int:
@@ -144,7 +135,7 @@ State = Literal["missing", "failed", "judged"]
 Verdict = Literal["nonconformity proven", "rejected", "undecided", "accepted", "conformity proven"]
 
 
-class JudgedPosition(StoredPart):
+class JudgedPosition(StoredResult):
     """Position of the plan: whether its file is missing, could not be evaluated (with the reason), or is judged.
 
     ``inputs`` is the digest of file, calibration and artefact; a later run takes the values of an unchanged position
@@ -167,7 +158,7 @@ class JudgedPosition(StoredPart):
     values: tuple[CharacteristicValue, ...] = ()
 
 
-class Acceptance(Brief, StoredPart):
+class Acceptance(Brief, StoredResult):
     """Result of `accept`, and the content of its file.
 
     Attributes
@@ -393,20 +384,21 @@ def _judge_position(
     state = {"sha256": content["file"], "inputs": inputs}
     try:
         cloud = _measure_cloud(file, calibration)
-        found = measure_position(cloud, plan, position)
+        values, on_artefact, rejected = measure_position(cloud, plan, position)
     except DescriptionError:
         raise
     except Error as error:
         return JudgedPosition(**plain, **state, state="failed", reason=str(error))
+    edited = [f"the {part} was edited after it was written" for part in [cloud.metadata.get(EDITED)] if part]
     return JudgedPosition(
         **plain,
         **state,
         state="judged",
         points=len(cloud),
-        on_artefact=found.on_artefact,
-        rejected=found.rejected,
-        warnings=(*cloud.warnings, *_edited_parts(cloud)),
-        values=tuple(found.values),
+        on_artefact=on_artefact,
+        rejected=rejected,
+        warnings=(*cloud.warnings, *edited),
+        values=tuple(values),
     )
 
 
@@ -418,11 +410,6 @@ def _measure_cloud(file: Path, calibration: AnyCalibration | None) -> PointCloud
         raise DescriptionError(f"{file} is a capture: the plan must name the `calibration` that reconstructs it")
     with Capture(file) as capture:
         return reconstruct(capture, calibration, with_uncertainty=False)
-
-
-def _edited_parts(cloud: PointCloud) -> list[str]:
-    """Return a warning if the cloud is based on a file that was edited after it was written."""
-    return [f"the {part} was edited after it was written" for part in [cloud.metadata.get(EDITED)] if part]
 
 
 def _remarks(plan: AcceptancePlan, characteristics: Sequence[Characteristic]) -> Iterator[str]:

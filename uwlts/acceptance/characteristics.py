@@ -8,13 +8,13 @@ The place of an artefact is found in the cloud, its size is that of the certific
 are measurements of the artefact, wherever they lie: only the share that VDI/VDE 2634 permits is left out.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Generic, Literal, get_args
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from scipy.spatial import KDTree
 from scipy.special import ndtr
 
@@ -38,10 +38,10 @@ from uwlts.evaluation.artefact_figures import (
     evaluate_step,
     measure_step,
 )
-from uwlts.evaluation.figures import TOWARDS_SENSOR, Verdict, judge_interval
+from uwlts.evaluation.figures import TOWARDS_SENSOR, StoredResult, Verdict, judge_interval
 from uwlts.fitting.least_squares import VDI_OUTLIER_SHARE, FitT, principal_axes
 from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard, StepStandard
-from uwlts.model.sensor import UnitVector, Vector
+from uwlts.model.sensor import UnitVector
 from uwlts.shapes.flat import Plane
 from uwlts.shapes.sphere import Sphere
 from uwlts.shapes.step import StepFace
@@ -57,23 +57,12 @@ _FACE_BAND = 0.25
 class MeasuredSurface(Generic[FitT]):
     """Surface fitted by least squares to the points of its region, without those that the rule leaves out.
 
-    Attributes
-    ----------
-    fit : Sphere or Plane
-        Fit to the kept points.
-    range_mm : float
-        Range of the distances of the kept points from the fit.
-    range_95_mm : float
-        Width of the narrowest band about the fit that contains 95 % of all points.
-    points : int
-        Number of points on the artefact.
-    rejected : int
-        Number of points that were left out: the farthest 0.3 %, rounded down.
+    All points are those of the artefact; the ``rejected`` ones are the farthest 0.3 %, rounded down.
     """
 
     fit: FitT
-    range_mm: float
-    range_95_mm: float
+    range_mm: float  # range of the distances of the kept points from the fit
+    range_95_mm: float  # width of the narrowest band about the fit that contains 95 % of all points
     points: int
     rejected: int
 
@@ -183,21 +172,15 @@ RULES: dict[DecisionRule, str] = {
 }
 """Text of each decision rule, with its edition."""
 
-_DECISIONS: dict[Verdict, Decision] = {
-    "within the limit": "conformity proven",
-    "exceeds the limit": "nonconformity proven",
-    "undecided": "undecided",
+_DECISIONS: dict[Verdict, tuple[Decision, Decision]] = {
+    "within the limit": ("conformity proven", "accepted"),
+    "exceeds the limit": ("nonconformity proven", "rejected"),
+    "undecided": ("undecided", "undecided"),
 }
-_SIMPLE: dict[Verdict, Decision] = {"within the limit": "accepted", "exceeds the limit": "rejected"}
+"""Decision with a guard band, and that of simple acceptance."""
 
 
-class StoredPart(BaseModel):
-    """Part of a stored result; fields of newer versions are kept."""
-
-    model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False)
-
-
-class CharacteristicValue(StoredPart):
+class CharacteristicValue(StoredResult):
     """Measured value of a characteristic at one position.
 
     Attributes
@@ -231,7 +214,7 @@ class CharacteristicValue(StoredPart):
     extent_mm: tuple[Spread, Spread] | None = None
 
 
-class Characteristic(StoredPart):
+class Characteristic(StoredResult):
     """Characteristic with its worst value, the maximum permissible error, and the decision.
 
     Attributes
@@ -265,7 +248,7 @@ class Characteristic(StoredPart):
 
     def limit_mm(self, value: CharacteristicValue) -> float | None:
         """Return the maximum permissible error of a value, mm; None if it is not stated."""
-        return _limit_mm(value, self.mpe_mm, self.mpe_mm_per_m)
+        return None if self.mpe_mm is None else self.mpe_mm + 1e-3 * self.mpe_mm_per_m * (value.length_mm or 0.0)
 
     def limit_text(self) -> str:
         """Return the maximum permissible error as text without its unit mm; empty if it is not stated."""
@@ -285,17 +268,10 @@ class Characteristic(StoredPart):
         return f"{100 * self.probability:.1f} %"
 
 
-@dataclass(frozen=True)
-class MeasuredPosition:
-    """Values at a position, and the numbers of points: on the artefact, and left out of these by the 0.3 % rule."""
-
-    values: list[CharacteristicValue]
-    on_artefact: int
-    rejected: int
-
-
-def measure_position(cloud: PointCloud, plan: AcceptancePlan, position: PlannedPosition) -> MeasuredPosition:
-    """Return all values of the characteristics at one position.
+def measure_position(
+    cloud: PointCloud, plan: AcceptancePlan, position: PlannedPosition
+) -> tuple[list[CharacteristicValue], int, int]:
+    """Return all values of the characteristics at one position, and the numbers of points on the artefact and left out.
 
     EvaluationError if the region does not show the artefact, or too many of its points are off.
     """
@@ -306,31 +282,48 @@ def measure_position(cloud: PointCloud, plan: AcceptancePlan, position: PlannedP
         low, high = np.array(position.region_mm).T
         inside = ((points >= low) & (points <= high)).all(axis=1)
         points, frame = points[inside], frame[inside]
-    margin = plan.margin_mm(artefact)
+    margin, form = plan.margin_mm(artefact), _form_expanded_mm(artefact)
+    values: list[CharacteristicValue] = []
+
+    def add(
+        symbol: Symbol, label: str, value_mm: float, expanded_mm: float | None, place_mm: np.ndarray, **more: object
+    ) -> None:
+        stated = {"symbol": symbol, "position": position.name, "label": label, "value_mm": value_mm}
+        placed = {"expanded_mm": expanded_mm, "place_mm": tuple(np.asarray(place_mm).tolist())}
+        values.append(CharacteristicValue.model_validate(stated | placed | more))
+
     match standard:
         case SphereStandard():
-            surfaces = measure_spheres(points, standard, margin_mm=margin)
-            values = list(_sphere_values(surfaces, standard, artefact, position.name, temperature))
-            return MeasuredPosition(values, sum(s.points for s in surfaces), sum(s.rejected for s in surfaces))
+            spheres = measure_spheres(points, standard, margin_mm=margin)
+            for number, (sphere, diameter) in enumerate(zip(spheres, standard.diameters_mm, strict=True), start=1):
+                by_size = _size_expanded_mm(artefact, standard.diameter_uncertainty_mm, diameter, temperature)
+                centre, label = sphere.fit.centre_mm, f"sphere {number}"
+                add("PF", label, sphere.range_mm, form, centre)
+                add("PF95", label, sphere.range_95_mm, form, centre)
+                add("PS", label, 2 * sphere.fit.radius_mm - diameter, by_size, centre)
+            centres = np.array([sphere.fit.centre_mm for sphere in spheres])
+            for number, calibrated in enumerate(standard.spacings_mm, start=1):
+                one, other = centres[number - 1 : number + 1]
+                spacing = float(np.linalg.norm(other - one))
+                by_size = _size_expanded_mm(artefact, standard.spacing_uncertainty_mm, calibrated, temperature)
+                label = "spacing" if len(standard.spacings_mm) == 1 else f"spacing {number}-{number + 1}"
+                direction = ((other - one) / spacing).tolist()
+                known = {"length_mm": calibrated, "direction": direction}
+                add("SD", label, spacing - calibrated, by_size, (other + one) / 2, **known)
+            return values, sum(each.points for each in spheres), sum(each.rejected for each in spheres)
         case PlaneStandard():
-            plane = measure_plane(points, standard, margin_mm=margin)
-            return MeasuredPosition(
-                list(_plane_values(plane, points, artefact, position.name)), plane.points, plane.rejected
-            )
+            plane, middle = measure_plane(points, standard, margin_mm=margin), points.mean(axis=0)
+            along = (points - middle) @ principal_axes(points - middle)[1][:2].T
+            known = {"direction": plane.fit.normal.tolist(), "extent_mm": np.ptp(along, axis=0).tolist()}
+            add("F", "plane", plane.range_mm, form, middle, **known)
+            add("F95", "plane", plane.range_95_mm, form, middle, **known)
+            return values, plane.points, plane.rejected
         case StepStandard():
             step = measure_step_height(points, frame, standard)
-            std = _size_std_mm(artefact, standard.height_uncertainty_mm, standard.height_mm, temperature)
-            value = CharacteristicValue(
-                symbol="E",
-                position=position.name,
-                label="height",
-                value_mm=step.height_error_mm,
-                expanded_mm=_expanded(std),
-                place_mm=step.point_mm,
-                length_mm=standard.height_mm,
-                direction=step.normal,
-            )
-            return MeasuredPosition([value], step.points_used, 0)
+            height, known = standard.height_mm, {"length_mm": standard.height_mm, "direction": step.normal}
+            by_size = _size_expanded_mm(artefact, standard.height_uncertainty_mm, height, temperature)
+            add("E", "height", step.height_error_mm, by_size, np.array(step.point_mm), **known)
+            return values, step.points_used, 0
         case PipeStandard():
             raise EvaluationError(f"a {standard.kind} has no characteristic of an acceptance test")
 
@@ -345,47 +338,39 @@ def judge_characteristic(
 ) -> Characteristic:
     """Return a characteristic with its worst value and the decision; for the limits see `Characteristic`."""
     own = [each for each in values if each.symbol == symbol]
-    limits = {id(each): _limit_mm(each, mpe_mm, mpe_mm_per_m) for each in own}
+    stated = {"symbol": symbol, "count": len(own), "mpe_mm": mpe_mm, "mpe_mm_per_m": mpe_mm_per_m}
+    limit_of = Characteristic(**stated, worst=None, decision="undecided").limit_mm
+    limits = [limit_of(each) for each in own]
     guard = _GUARDS[rule] / COVERAGE_FACTOR
-
-    def beyond(each: CharacteristicValue) -> float:
-        return abs(each.value_mm) + guard * (each.expanded_mm or 0.0) - (limits[id(each)] or 0.0)
-
-    judged = [_decide(each, limits[id(each)], rule) for each in own]
+    beyond = [
+        abs(each.value_mm) + guard * (each.expanded_mm or 0.0) - (limit or 0.0)
+        for each, limit in zip(own, limits, strict=True)
+    ]
+    judged = [_decide(each, limit, rule) for each, limit in zip(own, limits, strict=True)]
     if not own:
         judged: list[tuple[Decision, str]] = [("no MPE", "") if mpe_mm is None else ("undecided", "not measured")]
     order = get_args(Decision)
     decision, reason = min(judged, key=lambda each: order.index(each[0]))
-    chances = [_probability(each, limits[id(each)]) for each in own]
+    chances = [_probability(each, limit) for each, limit in zip(own, limits, strict=True)]
     known = [chance for chance in chances if chance is not None]
     return Characteristic(
-        symbol=symbol,
-        worst=max(own, key=beyond, default=None),
-        count=len(own),
-        mpe_mm=mpe_mm,
+        **stated,
+        worst=own[int(np.argmax(beyond))] if own else None,
         decision=decision,
         reason=reason,
         probability=min(known) if known and len(known) == len(chances) else None,
-        mpe_mm_per_m=mpe_mm_per_m,
     )
-
-
-def _limit_mm(value: CharacteristicValue, mpe_mm: float | None, mpe_mm_per_m: float) -> float | None:
-    return None if mpe_mm is None else mpe_mm + 1e-3 * mpe_mm_per_m * (value.length_mm or 0.0)
 
 
 def _decide(value: CharacteristicValue, limit_mm: float | None, rule: DecisionRule) -> tuple[Decision, str]:
     """Return the decision on one value, and the reason of an open one."""
     if limit_mm is None:
         return "no MPE", ""
-    size = abs(value.value_mm)
-    if rule == "simple":
-        return _SIMPLE[judge_interval(size, size, upper=limit_mm)], ""
-    where = f"{value.position}, {value.label}"
-    if value.expanded_mm is None:
+    size, where = abs(value.value_mm), f"{value.position}, {value.label}"
+    if value.expanded_mm is None and rule != "simple":
         return "undecided", f"the certificate states too little for a test value uncertainty ({where})"
-    guard = _GUARDS[rule] / COVERAGE_FACTOR * value.expanded_mm
-    decision = _DECISIONS[judge_interval(size - guard, size + guard, upper=limit_mm)]
+    guard = _GUARDS[rule] / COVERAGE_FACTOR * (value.expanded_mm or 0.0)
+    decision = _DECISIONS[judge_interval(size - guard, size + guard, upper=limit_mm)][rule == "simple"]
     return decision, f"the limit is within the guard band ({where})" if decision == "undecided" else ""
 
 
@@ -397,85 +382,19 @@ def _probability(value: CharacteristicValue, limit_mm: float | None) -> float | 
     return float(ndtr((limit_mm - value.value_mm) / std) - ndtr((-limit_mm - value.value_mm) / std))
 
 
-def _sphere_values(
-    surfaces: list[MeasuredSurface[Sphere]],
-    standard: SphereStandard,
-    artefact: CertifiedArtefact,
-    position: str,
-    temperature: Temperature | None,
-) -> Iterator[CharacteristicValue]:
-    for number, (sphere, diameter) in enumerate(zip(surfaces, standard.diameters_mm, strict=True), start=1):
-        by_size = _expanded(_size_std_mm(artefact, standard.diameter_uncertainty_mm, diameter, temperature))
-        by_form = _form_expanded_mm(artefact)
-        measured: tuple[tuple[Symbol, float, float | None], ...] = (
-            ("PF", sphere.range_mm, by_form),
-            ("PF95", sphere.range_95_mm, by_form),
-            ("PS", 2 * sphere.fit.radius_mm - diameter, by_size),
-        )
-        for symbol, value, expanded in measured:
-            yield CharacteristicValue(
-                symbol=symbol,
-                position=position,
-                label=f"sphere {number}",
-                value_mm=value,
-                expanded_mm=expanded,
-                place_mm=_vector(sphere.fit.centre_mm),
-            )
-    centres = np.array([sphere.fit.centre_mm for sphere in surfaces])
-    for number, calibrated in enumerate(standard.spacings_mm, start=1):
-        between = centres[number] - centres[number - 1]
-        spacing = float(np.linalg.norm(between))
-        std = _size_std_mm(artefact, standard.spacing_uncertainty_mm, calibrated, temperature)
-        yield CharacteristicValue(
-            symbol="SD",
-            position=position,
-            label="spacing" if len(standard.spacings_mm) == 1 else f"spacing {number}-{number + 1}",
-            value_mm=spacing - calibrated,
-            expanded_mm=_expanded(std),
-            place_mm=_vector((centres[number] + centres[number - 1]) / 2),
-            length_mm=calibrated,
-            direction=_vector(between / spacing),
-        )
-
-
-def _plane_values(
-    plane: MeasuredSurface[Plane], points: np.ndarray, artefact: CertifiedArtefact, position: str
-) -> Iterator[CharacteristicValue]:
-    middle = points.mean(axis=0)
-    along = (points - middle) @ principal_axes(points - middle)[1][:2].T
-    length, width = np.ptp(along, axis=0).tolist()
-    measured: tuple[tuple[Symbol, float], ...] = ("F", plane.range_mm), ("F95", plane.range_95_mm)
-    for symbol, value in measured:
-        yield CharacteristicValue(
-            symbol=symbol,
-            position=position,
-            label="plane",
-            value_mm=value,
-            expanded_mm=_form_expanded_mm(artefact),
-            place_mm=_vector(middle),
-            direction=_vector(plane.fit.normal),
-            extent_mm=(length, width),
-        )
-
-
-def _vector(values: np.ndarray) -> Vector:
-    x, y, z = values.tolist()
-    return x, y, z
-
-
 def _form_expanded_mm(artefact: CertifiedArtefact) -> float | None:
     """Return the test value uncertainty (k = 2) of a form error: half the artefact's form, and its uncertainty.
 
     The standard uncertainty is sqrt((F / 2)² + u(F)²) (ISO/TS 23165, probing error).
     """
     form = artefact.stated_form_mm()
-    return None if form is None else _expanded(float(np.hypot(form / 2, artefact.form_uncertainty_mm / 2)))
+    return None if form is None else COVERAGE_FACTOR * float(np.hypot(form / 2, artefact.form_uncertainty_mm / 2))
 
 
-def _size_std_mm(
+def _size_expanded_mm(
     artefact: CertifiedArtefact, calibrated_expanded_mm: float | None, length_mm: float, temperature: Temperature | None
 ) -> float | None:
-    """Return the standard uncertainty of a calibrated size in the test (ISO/TS 23165); None if not certified.
+    """Return the test value uncertainty (k = 2) of a calibrated size (ISO/TS 23165); None if not certified.
 
     Contributions are calibration, alignment, the temperature's uncertainty, and that of the expansion coefficient.
     """
@@ -486,11 +405,7 @@ def _size_std_mm(
         parts.append(length_mm * artefact.expansion_per_k * temperature.uncertainty_k / 2)
         warmer = temperature.value_c - REFERENCE_C
         parts.append(length_mm * warmer * artefact.expansion_uncertainty_per_k / 2)
-    return float(np.sqrt(np.sum(np.square(parts))))
-
-
-def _expanded(std_mm: float | None) -> float | None:
-    return None if std_mm is None else COVERAGE_FACTOR * std_mm
+    return COVERAGE_FACTOR * float(np.sqrt(np.sum(np.square(parts))))
 
 
 def describe_missing(artefact: CertifiedArtefact) -> list[str]:

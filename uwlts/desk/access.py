@@ -11,10 +11,10 @@ import re
 import secrets
 import socket
 from dataclasses import dataclass, field
-from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qs, urlsplit
 
 from starlette.datastructures import Headers
+from starlette.requests import cookie_parser
 from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocketClose
@@ -38,7 +38,8 @@ _POLICY = (
 
 def is_local(host: str) -> bool:
     """Return whether a host is reachable from this machine only."""
-    return host == "localhost" or _is_loopback(host)
+    address = _address(host)
+    return host == "localhost" or (address is not None and address.is_loopback)
 
 
 def _address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
@@ -46,11 +47,6 @@ def _address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
         return ipaddress.ip_address(name)
     except ValueError:
         return None
-
-
-def _is_loopback(name: str) -> bool:
-    address = _address(name)
-    return address is not None and address.is_loopback
 
 
 @dataclass(frozen=True)
@@ -104,14 +100,8 @@ class PageAccess:
 
     def is_operator(self, headers: Headers) -> bool:
         """Return whether a request has the token's cookie."""
-        for line in headers.getlist("Cookie"):
-            try:
-                kept = SimpleCookie(line).get(self.cookie)
-            except CookieError:
-                continue
-            if kept is not None and self._is_token(kept.value):
-                return True
-        return False
+        lines = headers.getlist("Cookie")
+        return any(self._is_token(cookie_parser(line).get(self.cookie, "")) for line in lines)
 
     def _is_token(self, text: str) -> bool:
         return hmac.compare_digest(text.encode(), self.token.encode())

@@ -1,6 +1,7 @@
 """Tab of the operator's page for analyses: form, progress, findings and files of the latest one."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -83,7 +84,9 @@ class AnalysisPanel:
         for each, made in self._fields.values():
             if each.file_kind:
                 options = _options(each, files)
-                made.set_options(options, value=_kept(made.value, options))
+                # Choices that have disappeared are dropped.
+                kept = [one for one in made.value if one in options] if isinstance(made.value, list) else made.value
+                made.set_options(options, value=kept if kept in options or isinstance(kept, list) else None)
 
     def _begin(self) -> None:
         overwrite = bool(self._replace.value)
@@ -143,24 +146,13 @@ def _files_by_kind(folder: Path) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     for file in list_files(folder):
         found.setdefault(file.kind, []).append(file.name)
-    found["description"] = [name for name in found.get("description", []) if _is_order(folder / name)]
-    return found
-
-
-def _is_order(path: Path) -> bool:
-    try:
-        load_order(path)
-    except Error:
-        return False
-    return True
+    orders = []
+    for name in found.pop("description", []):
+        with suppress(Error):
+            load_order(folder / name)
+            orders.append(name)
+    return found | {"description": orders}
 
 
 def _options(each: AnalysisField, files: dict[str, list[str]]) -> list[str]:
     return [*files.get(each.file_kind, []), *each.choices]
-
-
-def _kept(value: Any, options: list[str]) -> Any:
-    """Return the value without choices that have disappeared."""
-    if isinstance(value, list):
-        return [each for each in value if each in options]
-    return value if value in options else None

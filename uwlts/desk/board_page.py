@@ -10,7 +10,7 @@ import numpy as np
 from nicegui import ui
 from nicegui.element import Element
 
-from uwlts.desk.shown_state import FIELDS, KEPT_LINES, Board, LaserState, Picture, ShownLine
+from uwlts.desk.shown_state import FIELDS, KEPT_LINES, Board, LaserState, Picture
 from uwlts.pages.cloud_figure import THREE, VIEW
 
 
@@ -80,7 +80,7 @@ class BoardView:
             shown = self._cloud = CloudView(self._picked)
             with ui.row().classes("items-center px-2 py-1 gap-x-3 gap-y-0"):
                 colours = ui.select(["depth", *FIELDS], value="depth", label="colour").props("dense")
-                colours.classes("w-32").on_value_change(lambda event: shown.colour_by(event.value))
+                colours.classes("w-32").on_value_change(lambda event: shown.set_parameter("field", event.value))
                 ui.button("fit", on_click=shown.fit).props("flat dense")
                 self._count = ui.label().classes("text-sm")
 
@@ -91,7 +91,7 @@ class BoardView:
     def mark(self, places_mm: Sequence[np.ndarray]) -> None:
         """Mark places (3,) in the cloud."""
         if self._cloud is not None:
-            self._cloud.mark_places(places_mm)
+            self._cloud.set_parameter("marks", [place.tolist() for place in places_mm])
 
     def refresh(self) -> None:
         """Show what has changed."""
@@ -115,14 +115,16 @@ class BoardView:
                 self._map.props(f'src="coverage.png?{time.monotonic_ns()}"')
                 self._seen.set_visibility(True)
         if self._cloud is not None:
-            self._cloud.show_version(board.cloud.version)
-            self._cloud.allow_detail(board.detail is not None)
+            self._cloud.set_parameter("version", board.cloud.version)
+            self._cloud.set_parameter("closer", board.detail is not None)
             name = f"{board.cloud_name}: " if board.cloud_name else ""
             self._count.set_text(f"{name}{board.cloud.total:,} points")
         for line in board.lines(self._line):
             self._line = line.number
+            kind = "" if line.kind == "note" else f"{line.kind}: "
+            when = time.strftime("%H:%M:%S", time.localtime(line.time_s))
             with self._log:
-                shown = ui.label(_line_text(line)).classes(line.kind)
+                shown = ui.label(f"{when}  {kind}{line.text}").classes(line.kind)
             shown.move(target_index=0)
             if len(self._log.default_slot.children) > KEPT_LINES:
                 self._log.remove(-1)
@@ -136,11 +138,6 @@ def _progress_text(board: Board) -> str:
     if progress.left_s is not None:
         text += f", {math.ceil(progress.left_s) // 60} min {math.ceil(progress.left_s) % 60} s left"
     return text if place is None else f"{text} · stage at {place:.3f} mm"
-
-
-def _line_text(line: ShownLine) -> str:
-    kind = "" if line.kind == "note" else f"{line.kind}: "
-    return f"{time.strftime('%H:%M:%S', time.localtime(line.time_s))}  {kind}{line.text}"
 
 
 def _histogram(picture: Picture) -> str:
@@ -185,27 +182,15 @@ class CloudView(Element, component=VIEW, esm={"nicegui-scene": str(THREE.parent)
         if picked is not None:
             self.on("pick", lambda event: picked(np.array(event.args["at"], float)))
 
-    def show_version(self, version: int) -> None:
-        """Make the browser fetch the cloud if its version differs."""
-        self._set_parameter("version", version)
-
-    def allow_detail(self, allowed: bool) -> None:
-        """Set whether more points can be fetched for a closer view."""
-        self._set_parameter("closer", allowed)
-
-    def colour_by(self, field: str) -> None:
-        """Colour the points by depth or a field."""
-        self._set_parameter("field", field)
-
-    def mark_places(self, places_mm: Sequence[np.ndarray]) -> None:
-        """Mark positions (3,) in mm."""
-        self._set_parameter("marks", [place.tolist() for place in places_mm])
-
     def fit(self) -> None:
         """Fit the whole cloud into the view."""
-        self._set_parameter("fit", self._props["fit"] + 1)
+        self.set_parameter("fit", self._props["fit"] + 1)
 
-    def _set_parameter(self, name: str, value: object) -> None:
+    def set_parameter(self, name: str, value: object) -> None:
+        """Set a parameter of the view in the browser: cloud's version, field of the colours, marked places in mm.
+
+        ``closer`` states whether more points can be fetched for a closer view.
+        """
         if self._props[name] != value:
             self._props[name] = value
             self.update()

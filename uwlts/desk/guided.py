@@ -1,7 +1,14 @@
-"""Guided calibration on the page."""
+"""Guided calibration: leads through poses of the target and of the step standard, and records accepted images.
 
-import queue
-from collections.abc import Callable
+The captures are ordinary ones, so that the calibration can be repeated. However the recording ends, accepted images
+are kept and the laser goes off.
+"""
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -9,109 +16,149 @@ from typing import Literal
 import numpy as np
 from nicegui import ui
 
-from uwlts.calibration.guidance.pose_advice import Coverage
+from uwlts.calibration.camera.camera_parameters import CameraOptions
+from uwlts.calibration.camera.target_poses import Poses
+from uwlts.calibration.guidance.pose_advice import Setting, State
+from uwlts.calibration.guidance.step import PLACES, next_depth_mm, select_separate_depths
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, calibrate_sequentially
 from uwlts.desk.board_page import BoardView, update_regularly
-from uwlts.desk.laser_switch import LaserSwitch
+from uwlts.desk.guided_phases import Session, StepPhase, TargetPhase, list_missing
+from uwlts.desk.guided_plan import GuidedPlan, GuidedStage, load_guided_plan
+from uwlts.desk.guided_screen import ANSWERS, BoardScreen
 from uwlts.desk.server import DeskServer
-from uwlts.desk.shown_state import Board, Picture, encode_png
-from uwlts.errors import HardwareError
+from uwlts.desk.shown_state import Board
 from uwlts.hardware.grbl import GrblStage
-from uwlts.hardware.guided.guided_plan import GuidedPlan, load_guided_plan
-from uwlts.hardware.guided.operator import ANSWERS
-from uwlts.hardware.guided.record import GuidedRecording, guide
-from uwlts.hardware.rig import LaserStage
-
-_COVERED, _EMPTY, _DOT = (70, 140, 70), (120, 60, 60), (230, 230, 230)
-_MAP_CELL_PX = 48  # size of a cell of the map on the screen
+from uwlts.hardware.rig import HandSwitchedLaser, LaserStage, Rig, add_provenance
+from uwlts.hardware.scanning import check_camera, open_camera, read_unfinished
+from uwlts.model.calibration import WindowModel
+from uwlts.storage.capture import Capture, CaptureHeader, part_path
+from uwlts.storage.capture_writer import CaptureWriter
 
 
-class Ended(Exception):
-    """Raised when the operator has ended the recording."""
+@dataclass(frozen=True)
+class GuidedRecording:
+    """Captures of target and step standard, the kind of poses, and the missing evidence."""
+
+    air: tuple[Path, ...]
+    water: tuple[Path, ...]
+    step: tuple[Path, ...]
+    poses: Poses
+    missing: tuple[str, ...]
 
 
-class BoardScreen:
-    """Display of a guided calibration on a board, with answers from buttons; makes a ``switch`` if none is given."""
-
-    def __init__(self, board: Board, switch: LaserSwitch | None = None):
-        self._board, self.switch = board, switch or LaserSwitch(board, self.laser_off)
-        self._given: queue.SimpleQueue[str] = queue.SimpleQueue()
-        self._stage: LaserStage | None = None
-        self._ending = self._darkened = False
-
-    def press(self, answer: str) -> None:
-        """Store a button's answer."""
-        self._given.put(answer)
-
-    def end(self) -> None:
-        """End the recording at the next request for an answer; accepted images are kept."""
-        self._ending = True
-
-    def laser_off(self) -> None:
-        """Switch the laser off at any time; the recording ends and accepted images are kept."""
-        if isinstance(stage := self._stage, GrblStage):
-            self._darkened = True
-            darken(stage, self._board)
-        else:
-            self._board.say("no laser is connected to this program: switch it off by its own switch", "warning")
-
-    def answer(self) -> str | None:
-        """Return the oldest answer not yet returned, or None.
-
-        Raises Ended after `end`, and HardwareError after the laser was switched off.
-        """
-        if self._ending:
-            raise Ended
-        if self._darkened:
-            # Images of a hand-held target do not need the stage, whose fault would end the recording later.
-            raise HardwareError("the laser was switched off by hand, which ends the calibration: continue it later")
-        return None if self._given.empty() else self._given.get()
-
-    def request(self, text: str) -> None:
-        """Show what the operator should do."""
-        self._board.request, self._board.answers = text, ANSWERS
-
-    def live(
-        self, image: np.ndarray, *, full_dn: int, points: np.ndarray | None, stripe: np.ndarray | None, remark: str
-    ) -> None:
-        """Show an image (H, W) with the target's points (N, 2) and the stripe's pixels (N, 2) found in it."""
-        self._board.show(Picture(image, full_dn=full_dn, caption=remark, stripe=stripe, points=points))
-        if isinstance(self._stage, GrblStage):
-            self._board.laser = "on" if self._stage.laser_power > 0 else "flashing"
-
-    def show_coverage(self, coverage: Coverage, pixels: list[np.ndarray]) -> None:
-        """Show the coverage, with the points (N, 2) of every image."""
-        self._board.coverage = encode_png(draw_coverage(coverage, pixels))
-
-    def add(self, line: str) -> None:
-        """Add a line to the log."""
-        self._board.say(line)
-
-    def set_stage(self, stage: LaserStage | None) -> None:
-        """Set the stage that now switches the laser, or None once it is closed."""
-        self._stage = stage
-        self.switch.lend(stage)
-        self._board.laser = "flashing" if isinstance(stage, GrblStage) else "none"
+def guide(
+    plan: GuidedPlan,
+    out: Path,
+    screen: BoardScreen,
+    *,
+    refractions: Literal[1, 2] = 2,
+    distortion: tuple[str, ...] = ("k1", "k2"),
+    resume: bool,
+    overwrite: bool,
+) -> GuidedRecording:
+    """Lead through the images of a calibration on a screen; parameters and errors as `uwlts.desk.record_guided`."""
+    options = CalibrationOptions(refractions=refractions, poses=plan.poses, camera=CameraOptions(distortion=distortion))
+    setting = replace(plan.setting(), camera=options.camera)
+    phases = _Phases(plan, setting, plan.camera_address(), screen, resume, overwrite and not resume)
+    target, step = (out.with_name(f"{out.stem}-{shown}.h5") for shown in ("target", "step"))
+    missing = list_missing(phases.target(target))
+    if plan.step is not None:
+        with Capture(target) as capture:
+            known = calibrate_sequentially([capture], (), options=options).calibration
+        sensor = plan.described_sensor()
+        window = WindowModel.from_description(sensor.camera.window, sensor.laser.wavelength_nm, refractions=refractions)
+        missing += phases.step(step, StepPhase(plan.step, sensor, known, window))
+    return GuidedRecording(
+        air=(target,) if plan.target_in_air() else (),
+        water=() if plan.target_in_air() else (target,),
+        step=(step,) if plan.step is not None else (),
+        poses=plan.poses,
+        missing=tuple(missing),
+    )
 
 
-def darken(stage: GrblStage, board: Board) -> None:
-    """Switch the laser off at once, in any state of the stage, and report the result."""
-    if stage.darken():
-        board.say("laser switched off by hand: unlock the stage if it stood still, else home it", "warning")
-    else:
-        board.say("the laser CANNOT be switched off: switch its power off before going near", "error")
+@dataclass(frozen=True)
+class _Phases:
+    """Both phases of the recording; each opens camera and stage, because in between the tank is worked at."""
 
+    plan: GuidedPlan
+    setting: Setting
+    camera: str
+    screen: BoardScreen
+    resume: bool
+    overwrite: bool
 
-def draw_coverage(coverage: Coverage, pixels: list[np.ndarray]) -> np.ndarray:
-    """Draw a map (h, w, 3) of uint8: covered cells green, others red, and a dot for each point (N, 2)."""
-    cells = np.where(coverage.covered[..., None], _COVERED, _EMPTY).astype(np.uint8)
-    picture = np.kron(cells, np.ones((_MAP_CELL_PX, _MAP_CELL_PX, 1), np.uint8))
-    picture[::_MAP_CELL_PX] = picture[:, ::_MAP_CELL_PX] = 30
-    size = np.array(picture.shape[1::-1])
-    for points in pixels:
-        place = ((points + 0.5) / [coverage.width_px, coverage.height_px] * size).astype(int)
-        place = place[((place >= 0) & (place < size)).all(axis=1)]
-        picture[place[:, 1], place[:, 0]] = _DOT
-    return picture
+    def _find_unfinished(self, path: Path) -> Path | None:
+        """Return the recording to continue: an interrupted one, or a finished one that may not suffice."""
+        return next((each for each in (part_path(path), path) if each.is_file()), None) if self.resume else None
+
+    def target(self, path: Path) -> State:
+        """Record the target, and return the final state."""
+        plan = self.plan
+        phase, left = TargetPhase(plan, self.setting), self._find_unfinished(path)
+        state = phase.state([] if left is None else phase.read_recorded(left))
+        if left == path:
+            if plan.poses == "free":
+                more = bool(list_missing(state)) and len(state.recorded) < plan.most_images
+            else:
+                more = bool(plan.places_left(state.recorded))
+            if not more:
+                self.screen.say(f"{path.name} is complete: {len(state.recorded)} poses")
+                return state
+            os.replace(path, part_path(path))
+        positions = plan.places_left([])
+        with self._session(path, positions, plan.target_header(path.stem)) as session:
+            return phase.run(session, state)
+
+    def step(self, path: Path, phase: StepPhase) -> list[str]:
+        """Record the step standard, and return the missing evidence."""
+        step, left = phase.step, self._find_unfinished(path)
+        seen = [] if left is None else phase.depths_mm(left)
+        if left == path:
+            if next_depth_mm(seen, phase.sensor) is None:
+                self.screen.say(f"{path.name} is complete")
+                return []
+            os.replace(path, part_path(path))
+        request = f"bring the sensor into {step.medium}, with its window, and the step standard before it"
+        self.screen.request(request)
+        self.screen.wait(request)
+        with self._session(path, list(step.positions_mm), self.plan.step_header(path.stem, step)) as session:
+            seen = phase.run(session, seen)
+        count = len(select_separate_depths(seen, phase.sensor))
+        return [] if count >= PLACES else [f"the step standard was seen at {count} depths, expected {PLACES}"]
+
+    @contextmanager
+    def _session(self, path: Path, positions_mm: list[float], header: CaptureHeader) -> Iterator[Session]:
+        """Open camera and stage for the recording of a capture."""
+        sensor = self.setting.sensor
+        with self._stage(positions_mm) as stage, open_camera(self.camera) as camera:
+            check_camera(camera, sensor)
+            version = f"Grbl {stage.version}" if isinstance(stage, GrblStage) else "none"
+            header = add_provenance(header, self.plan, camera, source="guided calibration", stage=version)
+            dtype = np.dtype(np.uint16 if camera.info.bits > 8 else np.uint8)
+            ahead = positions_mm[-1] - positions_mm[0] if positions_mm else 1.0
+            rig = Rig(self.plan, self.plan.stage or GuidedStage(), sensor, camera, stage, ahead=ahead)
+            known, before_s = read_unfinished(path) if self.resume else ({}, 0.0)
+            with CaptureWriter(path, header, dtype=dtype, overwrite=self.overwrite, resume=self.resume) as writer:
+                yield Session(rig, self.plan, writer, self.screen, dtype=dtype, known_ms=known, before_s=before_s)
+
+    @contextmanager
+    def _stage(self, positions_mm: list[float]) -> Iterator[LaserStage]:
+        planned = self.plan.stage
+        if planned is None or planned.port is None:
+            yield HandSwitchedLaser(self.screen.wait)
+            return
+        with GrblStage(planned.port) as stage:
+            try:
+                self.screen.set_stage(stage)
+                planned.check(positions_mm, stage)
+                if planned.home:
+                    stage.home()
+                elif not stage.position_known:
+                    stage.unlock()
+                yield stage
+            finally:
+                self.screen.set_stage(None)
 
 
 def answer_buttons(board: Board, press: Callable[[str], None]) -> Callable[[], None]:
@@ -127,7 +174,7 @@ def answer_buttons(board: Board, press: Callable[[str], None]) -> Callable[[], N
 
     def refresh() -> None:
         request.set_text(board.request)
-        asked.set_visibility(bool(board.answers))
+        asked.set_visibility(bool(board.request))
 
     return refresh
 
@@ -189,7 +236,7 @@ def record_guided(
     described.camera_address()
     board = Board(described.title)
     board.phase("guided calibration")
-    screen = BoardScreen(board)
+    screen = BoardScreen(board, say=report, answers=sys.stdin.fileno())
 
     def build(board: Board, operator: bool) -> None:
         view = BoardView(board)
@@ -212,5 +259,4 @@ def record_guided(
             distortion=distortion,
             resume=resume,
             overwrite=overwrite,
-            report=report,
         )

@@ -1,10 +1,9 @@
 """Camera, stage and laser behind the page: a thread does one task after another and shows live images in between.
 
-Buttons put tasks into a queue. Only `laser_off`, `pause`, `resume` and `stop` act at once.
+Buttons put tasks into its queue by `Instrument.ask`. `laser_off`, `pause`, `resume` and `stop` act at once.
 """
 
 import math
-import os
 import queue
 import sys
 import threading
@@ -14,22 +13,23 @@ from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
+from typing import ParamSpec
 
 import numpy as np
 
 from uwlts.calibration.calibrate import calibrate
-from uwlts.desk.guided import BoardScreen, Ended, darken
+from uwlts.desk.guided import guide
+from uwlts.desk.guided_plan import GuidedPlan
+from uwlts.desk.guided_screen import BoardScreen, Ended, darken
 from uwlts.desk.laser_switch import LaserSwitch
 from uwlts.desk.recording_view import BackgroundView, RecordingView
 from uwlts.desk.shown_state import Board, FrameProfile, Picture
 from uwlts.errors import DescriptionError, Error, HardwareError
-from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.camera_interface import CameraDevice, GrabbedFrame
 from uwlts.hardware.continuous import ScanListeners
 from uwlts.hardware.grbl import GrblStage
-from uwlts.hardware.guided.guided_plan import GuidedPlan
-from uwlts.hardware.guided.record import guide
 from uwlts.hardware.rig import START_MS, HandSwitchedLaser, LaserStage, Rig, get_stripe, measure_brightness
 from uwlts.hardware.scan_plan import Light, ScanPlan
 from uwlts.hardware.scanning import check_camera, open_camera, record_scan
@@ -40,6 +40,7 @@ from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import Capture, Frame, drawable_image, part_path
 from uwlts.stripe import Stripe
 
+_P = ParamSpec("_P")
 _PREVIEW_S = 0.15  # pause between two live images
 _MOST_LOST = 2  # consecutive live images that may be lost before an error is reported
 _UNATTENDED_S = 5.0
@@ -89,6 +90,12 @@ class Instrument:
         self._thread = threading.Thread(target=self._run, name="instrument", daemon=True)
         self._thread.start()
 
+    @property
+    def _grbl(self) -> GrblStage | None:
+        # Read once: another thread may disconnect.
+        connected = self._connected
+        return connected.stage if connected is not None and isinstance(connected.stage, GrblStage) else None
+
     # Immediate actions.
 
     def laser_off(self) -> None:
@@ -97,16 +104,15 @@ class Instrument:
         if (screen := self._screen) is not None:
             screen.laser_off()
             return
-        connected = self._connected
-        if connected is None or not isinstance(connected.stage, GrblStage):
+        if (stage := self._grbl) is None:
             self._board.say("laser off: no laser is connected", "warning")
             return
         self._stop.set()
         self._paused.clear()
         self._darkened = True
-        darken(connected.stage, self._board)
+        darken(stage, self._board)
         self._show_laser()
-        self._ask(self._after_darkening)
+        self._work.put(self._recognise_darkening)
 
     def attend(self) -> None:
         """Record that an operator's page is open; live images with the laser end without it."""
@@ -144,48 +150,6 @@ class Instrument:
         if (screen := self._screen) is not None:
             screen.end()
 
-    # Queued tasks.
-
-    def connect(self, plan: ScanPlan, *, camera: str, stage: str | None) -> None:
-        """Open the camera, and the stage if its port is given, for a plan."""
-        self._ask(lambda: self._connect(plan, camera, stage))
-
-    def disconnect(self) -> None:
-        """Close camera and stage."""
-        self._ask(self._disconnect)
-
-    def home(self) -> None:
-        """Home the stage."""
-        self._ask(lambda: self._moving("homing", lambda stage: stage.home()))
-
-    def unlock(self) -> None:
-        """Unlock the stage and accept its position."""
-        self._ask(lambda: self._moving("unlocking", lambda stage: stage.unlock()))
-
-    def move(self, position_mm: float) -> None:
-        """Move the stage to a position."""
-        self._ask(lambda: self._move(position_mm))
-
-    def jog(self, by_mm: float) -> None:
-        """Move the stage by some mm."""
-        self._ask(lambda: self._jog(by_mm))
-
-    def find_exposure(self) -> None:
-        """Find the exposure for the light that is shown."""
-        self._ask(self._find_exposure)
-
-    def scan(self, plan: ScanPlan, out: Path, *, calibration: Path | None, resume: bool, overwrite: bool) -> None:
-        """Record a scan by a plan, in the worker thread.
-
-        A ``calibration`` gives a cloud that grows during the scan. ``resume`` continues an interrupted capture.
-        """
-        self._ask(lambda: self._scan(plan, out, calibration, resume, overwrite))
-
-    def calibrate(self, plan: GuidedPlan, out: Path, *, resume: bool, overwrite: bool) -> None:
-        """Lead through a guided calibration, which opens camera and stage itself, and calculate it."""
-        refuse_unsuitable(out, overwrite=overwrite)
-        self._ask(lambda: self._calibrate(plan, out, resume, overwrite))
-
     def answer(self, answer: str) -> None:
         """Pass the operator's answer to a guided calibration."""
         if (screen := self._screen) is not None:
@@ -195,13 +159,12 @@ class Instrument:
         """End all tasks and switch the laser off, once."""
         self._ending.set()
         self.stop()
-        self._ask(lambda: None)
+        self._work.put(lambda: None)
         self._thread.join(30.0)
 
-    # Worker thread.
-
-    def _ask(self, work: Callable[[], None]) -> None:
-        self._work.put(work)
+    def ask(self, task: Callable[_P, None], *args: _P.args, **kwargs: _P.kwargs) -> None:
+        """Put a task into the queue of the worker thread."""
+        self._work.put(partial(task, *args, **kwargs))
 
     def _run(self) -> None:
         while not self._ending.is_set():
@@ -211,7 +174,7 @@ class Instrument:
             except queue.Empty:
                 work = self._preview
             self._do(work)
-        self._do(self._disconnect)
+        self._do(self.disconnect)
 
     def _do(self, work: Callable[[], None]) -> None:
         try:
@@ -230,10 +193,10 @@ class Instrument:
         self._settle_state()
 
     def _settle_state(self) -> None:
-        connected, board = self._connected, self._board
-        if connected is None:
+        stage, board = self._grbl, self._board
+        if self._connected is None:
             self.state = InstrumentState.DISCONNECTED
-        elif isinstance(connected.stage, GrblStage) and not connected.stage.position_known:
+        elif stage is not None and not stage.position_known:
             self.state = InstrumentState.LOCKED
         else:
             self.state = InstrumentState.READY
@@ -243,8 +206,7 @@ class Instrument:
         self._show_laser()
 
     def _show_laser(self) -> None:
-        stage = None if self._connected is None else self._connected.stage
-        if not isinstance(stage, GrblStage):
+        if (stage := self._grbl) is None:
             self._board.laser = "none"
         elif stage.laser_unreachable:
             self._board.laser = "unknown"
@@ -256,8 +218,7 @@ class Instrument:
             self._board.laser = "flashing" if used else "off"
 
     def _switches_laser(self) -> bool:
-        stage = None if self._connected is None else self._connected.stage
-        return isinstance(stage, GrblStage) and stage.position_known
+        return (stage := self._grbl) is not None and stage.position_known
 
     def _begin(self, phase: str) -> _Connected:
         if self._connected is None:
@@ -274,8 +235,11 @@ class Instrument:
             self._board.show(replace(self._live, caption=f"not {self._live.caption}"))
         self._live = None
 
-    def _connect(self, plan: ScanPlan, camera: str, port: str | None) -> None:
-        self._disconnect()
+    # Tasks.
+
+    def connect(self, plan: ScanPlan, *, camera: str, stage: str | None) -> None:
+        """Open the camera, and the stage if its port is given, for a plan."""
+        self.disconnect()
         self.state = InstrumentState.BUSY
         self._board.phase("connecting")
         if not camera:
@@ -285,8 +249,8 @@ class Instrument:
             opened = stack.enter_context(open_camera(camera))
             check_camera(opened, sensor)
             moved: LaserStage = HandSwitchedLaser(self._board.say)
-            if port is not None:
-                moved = stack.enter_context(GrblStage(port))
+            if stage is not None:
+                moved = stack.enter_context(GrblStage(stage))
                 stack.callback(self.switch.lend, None)
                 self.switch.lend(moved)
             self._connected = _Connected(plan, sensor, opened, moved, stack.pop_all())
@@ -294,13 +258,14 @@ class Instrument:
         self._board.say(f"connected: {opened.info.name} {opened.info.serial}".strip())
         if isinstance(moved, GrblStage):
             low, high = moved.limits_mm
-            self._board.say(f"connected: Grbl {moved.version} on {port}, travel {low:g} to {high:g} mm")
+            self._board.say(f"connected: Grbl {moved.version} on {stage}, travel {low:g} to {high:g} mm")
             self._board.position_mm = moved.position_mm() if moved.position_known else None
         else:
             self._board.say("no stage is connected: images are shown, nothing can be scanned")
         self.light = "lamp"
 
-    def _disconnect(self) -> None:
+    def disconnect(self) -> None:
+        """Close camera and stage."""
         connected, self._connected, self._rig, self.light = self._connected, None, None, None
         self._end_live()
         if connected is not None:
@@ -311,10 +276,10 @@ class Instrument:
                 self._board.say(str(error), "warning")
             self._board.say("disconnected")
 
-    def _stage(self, connected: _Connected) -> GrblStage:
-        if not isinstance(connected.stage, GrblStage):
+    def _stage(self) -> GrblStage:
+        if (stage := self._grbl) is None:
             raise HardwareError("no stage is connected")
-        return connected.stage
+        return stage
 
     def _rig_of(self, connected: _Connected) -> Rig:
         """Return the rig, a new one after another task has used camera or stage."""
@@ -324,30 +289,42 @@ class Instrument:
         return self._rig
 
     def _moving(self, phase: str, work: Callable[[GrblStage], float]) -> None:
-        stage, self._rig = self._stage(self._begin(phase)), None
+        self._begin(phase)
+        stage, self._rig = self._stage(), None
         self._stop.clear()
         self._board.position_mm = work(stage)
         self._board.say(f"{phase} done: the stage is at {self._board.position_mm:.3f} mm")
 
-    def _move(self, position_mm: float) -> None:
+    def home(self) -> None:
+        """Home the stage."""
+        self._moving("homing", GrblStage.home)
+
+    def unlock(self) -> None:
+        """Unlock the stage and accept its position."""
+        self._moving("unlocking", GrblStage.unlock)
+
+    def move(self, position_mm: float) -> None:
+        """Move the stage to a position."""
         connected = self._begin(f"moving to {position_mm:.3f} mm")
-        self._stage(connected)
+        self._stage()
         self._board.position_mm = self._rig_of(connected).move_to(position_mm)
 
-    def _jog(self, by_mm: float) -> None:
-        stage = self._stage(self._begin("moving"))
+    def jog(self, by_mm: float) -> None:
+        """Move the stage by some mm."""
+        self._begin("moving")
+        stage = self._stage()
         low, high = stage.limits_mm
-        self._move(float(np.clip(stage.position_mm() + by_mm, low, high)))
+        self.move(float(np.clip(stage.position_mm() + by_mm, low, high)))
 
-    def _after_darkening(self) -> None:
-        connected = self._connected
-        if connected is not None and isinstance(connected.stage, GrblStage) and not connected.stage.faulty:
+    def _recognise_darkening(self) -> None:
+        if (stage := self._grbl) is not None and not stage.faulty:
             # The next exchange detects the reset and sets the fault.
             with suppress(HardwareError):
-                connected.stage.position_mm()
+                stage.position_mm()
         self._darkened = False
 
-    def _find_exposure(self) -> None:
+    def find_exposure(self) -> None:
+        """Find the exposure for the light that is shown."""
         light, connected = self.light, self._begin("finding the exposure")
         if light is None:
             raise HardwareError("choose first which light is shown")
@@ -412,10 +389,14 @@ class Instrument:
             self.calibration = None
             self._board.say(f"no profile is shown: {error}", "error")
 
-    def _scan(self, plan: ScanPlan, out: Path, calibration: Path | None, resume: bool, overwrite: bool) -> None:
+    def scan(self, plan: ScanPlan, out: Path, *, calibration: Path | None, resume: bool, overwrite: bool) -> None:
+        """Record a scan by a plan.
+
+        A ``calibration`` gives a cloud that grows during the scan. ``resume`` continues an interrupted capture.
+        """
         known: AnyCalibration | None = None if calibration is None else load_calibration(calibration)
         connected, board = self._begin("beginning the scan"), self._board
-        stage = self._stage(connected)
+        stage = self._stage()
         self._stop.clear()
         self._paused.clear()
         header = plan.header(out.stem)
@@ -466,18 +447,17 @@ class Instrument:
         board.say(f"wrote {out.name}")
         board.phase("finished", busy=False)
 
-    def _calibrate(self, plan: GuidedPlan, out: Path, resume: bool, overwrite: bool) -> None:
-        self._disconnect()
+    def calibrate(self, plan: GuidedPlan, out: Path, *, resume: bool, overwrite: bool) -> None:
+        """Lead through a guided calibration, which opens camera and stage itself, and calculate it."""
+        self.disconnect()
         board = self._board
         self.state = InstrumentState.BUSY
         board.phase("guided calibration")
         screen = self._screen = BoardScreen(board, self.switch)
-        nobody = os.open(os.devnull, os.O_RDONLY)
         try:
-            recording = guide(plan, out, screen, resume=resume, overwrite=overwrite, report=board.say, answers=nobody)
+            recording = guide(plan, out, screen, resume=resume, overwrite=overwrite)
         finally:
-            os.close(nobody)
-            self._screen, board.request, board.answers = None, "", ()
+            self._screen, board.request = None, ""
         for line in recording.missing:
             board.say(f"still missing: {line}; continue it for more images", "warning")
         board.phase("calibrating")

@@ -59,13 +59,6 @@ class Plot:
         half = (self.bar_width or 0.0) / 2
         return _widen(float(self.across.min()) - half, float(self.across.max()) + half)
 
-    @property
-    def up_range(self) -> tuple[float, float]:
-        """Range of the vertical axis, which begins at zero for bars."""
-        if self.bar_width is not None:
-            return 0.0, max(1.0, (1 + _MARGIN) * float(self.up.max()))
-        return _widen(float(self.up.min()), float(self.up.max()))
-
     def place_of(self, pixel: float) -> float:
         """Return the horizontal coordinate of a pixel column."""
         low, high = self.across_range
@@ -75,13 +68,17 @@ class Plot:
         """Return the plot as the content of an SVG element of 360 x 220 px."""
         x = _scale(*self.across_range, _LEFT, _WIDTH - _RIGHT)
         ends = (_TOP, _HEIGHT - _BOTTOM) if self.downwards else (_HEIGHT - _BOTTOM, _TOP)
-        y = _scale(*self.up_range, *ends)
+        # The axis of bars begins at zero.
+        up_range = _widen(float(self.up.min()), float(self.up.max()))
+        if self.bar_width is not None:
+            up_range = 0.0, max(1.0, (1 + _MARGIN) * float(self.up.max()))
+        y = _scale(*up_range, *ends)
         parts = [f'<rect width="{_WIDTH}" height="{_HEIGHT}" fill="white"/>']
         for value, text in ticks(*self.across_range):
             at = x(value)
             parts.append(_line(at, _TOP, at, _HEIGHT - _BOTTOM, "#dde2e8"))
             parts.append(_text(at, _HEIGHT - _BOTTOM + 13, text, "middle"))
-        for value, text in ticks(*self.up_range):
+        for value, text in ticks(*up_range):
             at = y(value)
             parts.append(_line(_LEFT, at, _WIDTH - _RIGHT, at, "#dde2e8"))
             parts.append(_text(_LEFT - 4, at + 4, text, "end"))
@@ -139,30 +136,6 @@ def _text(x: float, y: float, text: str, anchor: str) -> str:
     return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" {style}>{escape(text)}</text>'
 
 
-class PlotView:
-    """Plot in one browser; ``picked`` is called with the horizontal coordinate of a click."""
-
-    def __init__(self, picked: Callable[[float], None]):
-        self._picked = picked
-        self._plot: Plot | None = None
-        # The content is made by `Plot.draw`, which escapes texts.
-        self._image = ui.interactive_image(size=(_WIDTH, _HEIGHT), on_mouse=self._click, sanitize=False)
-        self._image.classes("plot w-full").props('role="img"')
-        self._image.set_visibility(False)
-
-    def show(self, plot: Plot | None) -> None:
-        """Show a plot, or nothing."""
-        self._plot = plot
-        self._image.set_visibility(plot is not None)
-        if plot is not None:
-            self._image.props(f'aria-label="{escape(plot.up_label)} over {escape(plot.across_label)}"')
-            self._image.set_content(plot.draw())
-
-    def _click(self, event: MouseEventArguments) -> None:
-        if self._plot is not None:
-            self._picked(self._plot.place_of(event.image_x))
-
-
 _BINS = 60  # of the displayed histogram
 _DEFAULT_RADIUS_MM, _DEFAULT_WIDTH_MM = 15.0, 2.0
 _GROWING = "points of a running scan have no uncertainty: reconstruct it"
@@ -205,6 +178,7 @@ class MeasurePanel:
         self._rows: dict[int, _Row] = {}
         self._shown: MeasuredValues | None = None
         self._tool: Tool = "distance"
+        self._plot: Plot | None = None
 
     def build(self) -> None:
         """Build the tab."""
@@ -225,7 +199,9 @@ class MeasurePanel:
             self._width = NumberField("width, mm", value=_DEFAULT_WIDTH_MM, min=0.001)
             self._field = ui.select(["Z", "intensity", "deviation"], value="Z", label="field")
             self._button("histogram", self._show_histogram).props("outline dense")
-        self._plot = PlotView(self._pick_along)
+        # The content is made by `Plot.draw`, which escapes texts.
+        self._image = ui.interactive_image(size=(_WIDTH, _HEIGHT), on_mouse=self._pick_along, sanitize=False)
+        self._image.classes("plot w-full").props('role="img"').set_visibility(False)
         self._caption = ui.label().classes("text-sm font-mono")
         with ui.row().classes("gap-2") as self._in_section:
             for tool in get_args(Tool):
@@ -316,11 +292,16 @@ class MeasurePanel:
         self._live, self._section, self._places_mm, self._without = True, None, [], _LIVE_WITHOUT
         self.refresh()
 
-    def _pick_along(self, along_mm: float) -> None:
-        if self._section is None:
-            return
-        self._places_mm = [*self._places_mm, along_mm][-2:]
-        self._show_section()
+    def _pick_along(self, event: MouseEventArguments) -> None:
+        if self._section is not None and self._plot is not None:
+            self._places_mm = [*self._places_mm, self._plot.place_of(event.image_x)][-2:]
+            self._show_section()
+
+    def _draw(self, plot: Plot) -> None:
+        self._plot = plot
+        self._image.set_visibility(True)
+        self._image.props(f'aria-label="{escape(plot.up_label)} over {escape(plot.across_label)}"')
+        self._image.set_content(plot.draw())
 
     def _choose_tool(self, tool: Tool) -> None:
         self._tool = tool
@@ -345,7 +326,7 @@ class MeasurePanel:
             self._source = f"profile at X {section.cloud.points_mm[0, 0]:.3f} mm"
         nearest = [section.find_nearest(place) for place in self._places_mm]
         along, depth = section.along_mm, section.depth_mm
-        self._plot.show(
+        self._draw(
             Plot(
                 along,
                 depth,
@@ -374,7 +355,7 @@ class MeasurePanel:
         width = float(edges[1] - edges[0])
         self._live, self._section = False, None
         self._in_section.set_visibility(False)
-        self._plot.show(Plot(edges[:-1] + width / 2, counts, f"{name} / {unit}", "points", bar_width=width))
+        self._draw(Plot(edges[:-1] + width / 2, counts, f"{name} / {unit}", "points", bar_width=width))
         self._caption.set_text(
             f"{name}: mean {values.mean():.4f}, standard deviation {values.std():.4f} {unit}, {len(values):,} points"
         )
@@ -385,7 +366,7 @@ class MeasurePanel:
         """Update the rows; rows that remain keep the focus."""
         known = {each.number for each in values.values}
         for number in [number for number in self._rows if number not in known]:
-            self._rows.pop(number).delete()
+            self._rows.pop(number).element.delete()
         for place, value in enumerate(values.values):
             if value.number not in self._rows:
                 with self._list:
@@ -426,10 +407,17 @@ class _Row:
         self._number, self._measuring, self._board = number, measuring, board
         self._list = ui.context.slot.parent
         self._shown: MeasuredValue | None = None
-        with ui.element("div").classes("measured") as self._element:
-            self._name = ui.input("name").props("dense").on("change", self._rename)
-            self._lower = NumberField("lower, mm").props("dense").on("change", self._limit)
-            self._upper = NumberField("upper, mm").props("dense").on("change", self._limit)
+
+        def renamed(values: MeasuredValues) -> MeasuredValues:
+            return values.rename(number, str(self._name.value or ""))
+
+        def limited(values: MeasuredValues) -> MeasuredValues:
+            return values.limit(number, self._lower.value, self._upper.value)
+
+        with ui.element("div").classes("measured") as self.element:
+            self._name = ui.input("name").props("dense").on("change", lambda: self._change(renamed))
+            self._lower = NumberField("lower, mm").props("dense").on("change", lambda: self._change(limited))
+            self._upper = NumberField("upper, mm").props("dense").on("change", lambda: self._change(limited))
             self._text = ui.label().classes("value font-mono text-sm")
             self._verdict = ui.label().classes("verdict text-sm")
             button("remove", self._remove).props("flat dense")
@@ -440,22 +428,16 @@ class _Row:
         self._text.set_text(value.interval_text())
         self._verdict.set_text(value.verdict)
         self._verdict.props(f'data-verdict="{value.verdict}"')
-        if self._list.default_slot.children[place] is not self._element:
-            self._element.move(target_index=place)
+        if self._list.default_slot.children[place] is not self.element:
+            self.element.move(target_index=place)
 
     def _show_fields(self, value: MeasuredValue, *, restore: bool = False) -> None:
         """Show name and limits; without ``restore`` only changed ones, because the user may be typing in the others."""
         before, self._shown = self._shown, value
-        if restore or before is None or value.name != before.name:
-            self._name.value = value.name
-        if restore or before is None or value.lower_mm != before.lower_mm:
-            self._lower.value = value.lower_mm
-        if restore or before is None or value.upper_mm != before.upper_mm:
-            self._upper.value = value.upper_mm
-
-    def delete(self) -> None:
-        """Remove the row."""
-        self._element.delete()
+        for element, name in ((self._name, "name"), (self._lower, "lower_mm"), (self._upper, "upper_mm")):
+            wanted = getattr(value, name)
+            if restore or before is None or wanted != getattr(before, name):
+                element.value = wanted
 
     def _change(self, change: Callable[[MeasuredValues], MeasuredValues]) -> None:
         values = self._measuring.values
@@ -469,13 +451,6 @@ class _Row:
         else:
             # At once: the next refresh may come after the user has typed on.
             self._show_fields(self._measuring.values.find(self._number))
-
-    def _rename(self) -> None:
-        self._change(lambda values: values.rename(self._number, str(self._name.value or "")))
-
-    def _limit(self) -> None:
-        lower, upper = self._lower.value, self._upper.value
-        self._change(lambda values: values.limit(self._number, lower, upper))
 
     def _remove(self) -> None:
         self._measuring.values = self._measuring.values.remove(self._number)

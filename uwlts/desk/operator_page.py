@@ -4,6 +4,7 @@ import asyncio
 import threading
 from collections.abc import Awaitable, Callable
 from contextlib import closing, suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from urllib.parse import quote
@@ -19,12 +20,13 @@ from uwlts.desk.analysis_panel import AnalysisPanel
 from uwlts.desk.board_page import BoardView, NumberField, build_board, update_regularly
 from uwlts.desk.desk_files import find_file, guess_kind, list_files, new_path
 from uwlts.desk.guided import answer_buttons
+from uwlts.desk.guided_plan import load_guided_plan
 from uwlts.desk.instrument import Instrument, InstrumentState
 from uwlts.desk.measure_panel import MeasurePanel, Measuring
 from uwlts.desk.server import DeskServer
 from uwlts.desk.shown_state import FIELDS, Board, point_table
 from uwlts.errors import DescriptionError, Error
-from uwlts.hardware.guided.guided_plan import load_guided_plan
+from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.scan_plan import ScanPlan, StagePlan, load_plan
 from uwlts.model.library import validate_description
 from uwlts.report.file_description import describe
@@ -97,16 +99,18 @@ def serve_desk(
                 report("closed")
 
 
+@dataclass(eq=False)
 class _Desk:
     """State shared by all browsers: the folder, the instrument, the chosen plan and the opened cloud."""
 
-    def __init__(
-        self, folder: Path, board: Board, instrument: Instrument, plan_path: Path | None, plan: ScanPlan | None
-    ):
-        self.folder, self.board, self.instrument = folder, board, instrument
-        self.plan_path, self.plan = plan_path, plan
-        self.measuring = Measuring()
-        self.analyses = Analyses(folder, board, self._show_result)
+    folder: Path
+    board: Board
+    instrument: Instrument
+    plan_path: Path | None
+    plan: ScanPlan | None
+
+    def __post_init__(self) -> None:
+        self.measuring, self.analyses = Measuring(), Analyses(self.folder, self.board, self._show_result)
 
     def serve_files(self, server: DeskServer) -> None:
         """Add a route for the files of the folder; viewers may fetch reports only."""
@@ -140,10 +144,6 @@ class _Desk:
                 load(path)
                 found[str(path)] = path.name
         return found
-
-    def calibrations(self) -> list[str]:
-        """Return the names of the calibrations."""
-        return [file.name for file in list_files(self.folder) if file.kind == "calibration"]
 
     def show_cloud(self, name: str, cloud: PointCloud, *, of: int | None = None) -> None:
         """Show a cloud, a sample ``of`` that many points, thinned if it is large, and make it the one to measure.
@@ -207,31 +207,25 @@ class _OperatorPage:
             view.image()
             view.cloud()
             with ui.element("section").classes("tools").props('aria-label="controls"'):
+                parts = {
+                    "Connect": self._connect_part,
+                    "Stage": self._stage_part,
+                    "Calibrate": self._calibrate_part,
+                    "Scan": self._scan_part,
+                    "Files": self._files_part,
+                    "Inspect": self._analyses.build,
+                    "Measure": self._measure.build,
+                }
                 with ui.tabs().props("dense no-caps align=left") as self._tabs:
-                    names = ["Connect", "Stage", "Calibrate", "Scan", "Files", "Inspect", "Measure"]
-                    shown = {name: ui.tab(name) for name in names}
-                with (
-                    ui.tab_panels(self._tabs, value=shown["Connect"], animated=False)
-                    .classes("w-full")
-                    .props("keep-alive")
-                ):
-                    for name, part in zip(names, self._parts(), strict=True):
-                        with ui.tab_panel(shown[name]).classes("gap-2"):
+                    for name in parts:
+                        ui.tab(name)
+                with ui.tab_panels(self._tabs, value="Connect", animated=False).classes("w-full").props("keep-alive"):
+                    for name, part in parts.items():
+                        with ui.tab_panel(name).classes("gap-2"):
                             part()
             view.log()
         update_regularly(self._refresh)
         ui.timer(_LIST_S, self._list)
-
-    def _parts(self) -> tuple[Callable[[], None], ...]:
-        return (
-            self._connect_part,
-            self._stage_part,
-            self._calibrate_part,
-            self._scan_part,
-            self._files_part,
-            self._analyses.build,
-            self._measure.build,
-        )
 
     def _button(
         self, label: str, press: Callable[[], object], states: tuple[InstrumentState, ...] | None = None
@@ -272,6 +266,7 @@ class _OperatorPage:
     # Connect
 
     def _connect_part(self) -> None:
+        device, ask = self._instrument, self._instrument.ask
         plans, plan = self._desk.plans(load_plan), self._desk.plan
         chosen = None if self._desk.plan_path is None else str(self._desk.plan_path)
         # Here and below, values are passed to the constructors: a value set later reaches the browser as a message, and
@@ -283,7 +278,7 @@ class _OperatorPage:
         self._stage = ui.input("stage", value=stage, placeholder="/dev/ttyACM0; empty: none").classes("w-full")
         with ui.row():
             self._button("connect", self._connect, (InstrumentState.DISCONNECTED, *_FREE))
-            self._button("disconnect", self._instrument.disconnect, _FREE).props("outline")
+            self._button("disconnect", partial(ask, device.disconnect), _FREE).props("outline")
         ui.separator()
         ui.label("live image").classes("text-sm")
         self._light = ui.toggle({"lamp": "lamp", "laser": "laser", "none": "stop"}, value="none")
@@ -293,7 +288,7 @@ class _OperatorPage:
         with ui.element("div").classes("fields"):
             self._exposure = NumberField("exposure, ms", value=self._exposed[1], min=0.001, step=0.1, format="%.3g")
             self._exposure.on("change", self._expose)
-            self._button("find exposure", self._instrument.find_exposure, (InstrumentState.READY,)).props("outline")
+            self._button("find exposure", partial(ask, device.find_exposure), (InstrumentState.READY,)).props("outline")
         ui.label("The laser is on only while an image is exposed.").classes("text-xs")
 
     def _choose(self) -> None:
@@ -315,7 +310,8 @@ class _OperatorPage:
         return self._desk.plan
 
     def _connect(self) -> None:
-        self._instrument.connect(self._chosen_plan(), camera=self._camera.value or "", stage=self._stage.value or None)
+        addresses = {"camera": self._camera.value or "", "stage": self._stage.value or None}
+        self._instrument.ask(self._instrument.connect, self._chosen_plan(), **addresses)
 
     def _look(self, light: str) -> None:
         wanted = None if light == "none" else "laser" if light == "laser" else "lamp"
@@ -335,19 +331,20 @@ class _OperatorPage:
     # Stage
 
     def _stage_part(self) -> None:
+        device, ask = self._instrument, self._instrument.ask
         with ui.row():
-            self._button("home", self._instrument.home, _FREE)
-            self._button("unlock", self._instrument.unlock, _FREE).props("outline")
+            self._button("home", partial(ask, device.home), _FREE)
+            self._button("unlock", partial(ask, device.unlock), _FREE).props("outline")
         ui.label("Unlock only where nothing moved since the position was known.").classes("text-xs")
         with ui.row().classes("gap-1"):
             for by in _JOGS_MM:
                 label = f"{by:+g}".replace("-", "−")
-                self._button(label, partial(self._instrument.jog, by), (InstrumentState.READY,)).props(
+                self._button(label, partial(ask, device.jog, by), (InstrumentState.READY,)).props(
                     f'outline dense aria-label="move by {by:+g} mm"'
                 )
         with ui.row().classes("items-center"):
             place = NumberField("position, mm", value=0.0, format="%.3f")
-            self._button("move", lambda: self._instrument.move(float(place.value or 0.0)), (InstrumentState.READY,))
+            self._button("move", lambda: ask(device.move, float(place.value or 0.0)), (InstrumentState.READY,))
 
     # Calibrate
 
@@ -373,7 +370,9 @@ class _OperatorPage:
         plan = load_guided_plan(Path(self._guided_plan.value))
         plan = plan.with_connection(camera=self._camera.value or None, port=self._stage.value or None)
         out = new_path(self._desk.folder, self._calibration_name.value or "", suffix=".json")
-        self._instrument.calibrate(plan, out, resume=resume, overwrite=bool(self._replace.value))
+        overwrite = bool(self._replace.value)
+        refuse_unsuitable(out, overwrite=overwrite)
+        self._instrument.ask(self._instrument.calibrate, plan, out, resume=resume, overwrite=overwrite)
 
     # Scan
 
@@ -431,7 +430,8 @@ class _OperatorPage:
             raise DescriptionError(f"{out.name} was interrupted: continue it, give another name, or tick 'replace'")
         known = self._calibration.value
         self._desk.measuring.open(None)
-        self._instrument.scan(
+        self._instrument.ask(
+            self._instrument.scan,
             plan.model_copy(update={"stage": stage}),
             out,
             calibration=self._desk.folder / known if known else None,
@@ -457,7 +457,8 @@ class _OperatorPage:
         if known == self._files:
             return
         self._files = known
-        self._calibration.set_options(self._desk.calibrations(), value=self._calibration.value)
+        calibrations = [file.name for file in files if file.kind == "calibration"]
+        self._calibration.set_options(calibrations, value=self._calibration.value)
         for choice, load in ((self._plan, load_plan), (self._guided_plan, load_guided_plan)):
             choice.set_options(self._desk.plans(load), value=choice.value)
         self._analyses.set_files()

@@ -4,7 +4,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Self
 
@@ -25,17 +25,6 @@ _WAITING = 64  # images in the queue for display during a scan; further ones are
 _FAINT, _MANY, _FEW = 0.1, 0.05, 0.05
 """Limits of a laser image: faint below this fraction of full scale; saturated above this fraction of saturated lines;
 too little of the stripe below this fraction of lines with a point."""
-
-
-@dataclass(frozen=True, eq=False)
-class _SeenStripe:
-    """Stripe of one laser image: pixels (N, 2), profile if a calibration is known, warnings."""
-
-    pixels: np.ndarray
-    profile: FrameProfile | None
-    lines: int
-    saturated: float | None
-    remarks: tuple[str, ...]
 
 
 class RecordingView:
@@ -61,45 +50,31 @@ class RecordingView:
         if not frame.laser_on:
             board.show(Picture(frame.image, full_dn=full, caption=caption))
             return
-        seen = _find(frame, self._header, self._calibration)
-        self._found, self._lines = self._found + len(seen.pixels), self._lines + seen.lines
+        camera = self._header.sensor.camera
+        stripe = find_stripe(frame.seen, stripe_along=camera.stripe_along, saturation=full)
+        pixels, saturated, remarks = stripe.pixels(), None, []
+        self._found, self._lines = self._found + len(pixels), self._lines + len(stripe.status)
         caption += f"; stripe on {self._found:,} of {self._lines:,} profile lines so far"
-        board.show(
-            Picture(
-                drawable_image(frame.seen, self._header.sensor.camera),
-                full_dn=full,
-                caption=caption,
-                stripe=seen.pixels,
-                saturated=seen.saturated,
-            )
-        )
-        if (profile := seen.profile) is not None:
+        if isinstance(frame.seen, np.ndarray):
+            brightest = frame.seen.max(axis=0 if camera.stripe_along == "width" else 1)
+            saturated = float((brightest >= full).mean())
+            if saturated > _MANY:
+                remarks.append("saturated on many lines: shorten the exposure")
+            elif np.quantile(brightest, 0.98) < _FAINT * full:
+                remarks.append("faint: lengthen the exposure, or is the laser off?")
+        if len(stripe.lines) < _FEW * len(stripe.status):
+            remarks.append("almost no stripe: is the object in the volume?")
+        image = drawable_image(frame.seen, camera)
+        board.show(Picture(image, full_dn=full, caption=caption, stripe=pixels, saturated=saturated))
+        if self._calibration is not None and len(stripe.lines):
+            profile = FrameProfile(frame, stripe, self._header, self._calibration)
             board.cloud.add(profile.points.points_mm, intensity=profile.points.intensity)
             board.profile = profile
-        for remark in seen.remarks:
+        for remark in remarks:
             # Once each, because they stay in the log.
             if remark not in self._said:
                 self._said.add(remark)
                 board.say(f"image {number + 1}: {remark}", "warning")
-
-
-def _find(frame: Frame, header: CaptureHeader, calibration: AnyCalibration | None) -> _SeenStripe:
-    along, full = header.sensor.camera.stripe_along, header.saturation_dn
-    stripe = find_stripe(frame.seen, stripe_along=along, saturation=full)
-    profile = None
-    if calibration is not None and len(stripe.lines):
-        profile = FrameProfile(frame, stripe, header, calibration)
-    saturated, remarks = None, []
-    if isinstance(frame.seen, np.ndarray):
-        brightest = frame.seen.max(axis=0 if along == "width" else 1)
-        saturated = float((brightest >= full).mean())
-        if saturated > _MANY:
-            remarks.append("saturated on many lines: shorten the exposure")
-        elif np.quantile(brightest, 0.98) < _FAINT * full:
-            remarks.append("faint: lengthen the exposure, or is the laser off?")
-    if len(stripe.lines) < _FEW * len(stripe.status):
-        remarks.append("almost no stripe: is the object in the volume?")
-    return _SeenStripe(stripe.pixels(), profile, len(stripe.status), saturated, tuple(remarks))
 
 
 def follow_frames(path: Path) -> Iterator[tuple[CaptureHeader, int, Frame] | None]:

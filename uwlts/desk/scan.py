@@ -12,17 +12,17 @@ import sys
 import threading
 import time
 from array import array
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import replace
 from importlib import import_module
 from itertools import count
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
-from uwlts.desk.guided import Ended
+from uwlts.desk.guided_screen import Ended
 from uwlts.desk.recording_view import LOOK_S, BackgroundView, follow_frames
 from uwlts.desk.shown_state import FrameProfile
 from uwlts.errors import DescriptionError, Error, HardwareError, SetupError
@@ -132,7 +132,10 @@ def scan(
             raise DescriptionError("`calibration` is for the cloud on the page: give `watch` too")
         load_calibration(calibration)
     with ExitStack() as stack:
-        page = stack.enter_context(WatchPage(out, calibration=calibration, port=port, say=report)) if watch else None
+        page = (
+            open_watch_page(out, calibration=calibration, port=port, say=report) if watch else nullcontext(lambda: None)
+        )
+        show = stack.enter_context(page)
         moved, opened = stack.enter_context(GrblStage(serial_port)), stack.enter_context(open_camera(address))
         if home:
             report("homing")
@@ -146,60 +149,57 @@ def scan(
             stage=moved,
             resume=resume,
             overwrite=overwrite,
-            listeners=ScanListeners(
-                progress, report, warn, recorded=lambda frame, number: None if page is None else page.start()
-            ),
+            listeners=ScanListeners(progress, report, warn, recorded=lambda frame, number: show()),
         )
 
 
-class WatchPage:
-    """Page that shows a recording from `start` until the ``with`` ends; its failures do not affect the recording.
+@contextmanager
+def open_watch_page(
+    capture: Path, *, calibration: str | Path | None, port: int, say: Callable[[str], None]
+) -> Iterator[Callable[[], None]]:
+    """Return a function that opens a page with a recording until the ``with`` ends; later calls do nothing.
 
-    The page is a separate process, which can neither slow the recording nor end it. ``say`` is called, from another
-    thread, with a line that states the page's address.
+    It is called after the recording has begun: before that, a file of its name would be an older one. The page is a
+    separate process, which can neither slow the recording nor end it. ``say`` is called, from another thread, with a
+    line that states the page's address.
     """
+    command = [sys.executable, "-m", "uwlts", "watch", str(capture), "--port", str(port)]
+    command += ["--calibration", str(calibration)] if calibration else []
+    opened: list[subprocess.Popen[str]] = []
 
-    def __init__(self, capture: Path, *, calibration: str | Path | None, port: int, say: Callable[[str], None]):
-        command = [sys.executable, "-m", "uwlts", "watch", str(capture), "--port", str(port)]
-        self._command = [*command, "--calibration", str(calibration)] if calibration else command
-        self._say = say
-        self._process: subprocess.Popen[str] | None = None
+    def announce() -> None:
+        # Further lines are read, so that the pipe does not fill up.
+        for line in opened[0].stdout or ():
+            if line.startswith("open "):
+                say(f"{line.split(';')[0]}, while the scan runs")
 
-    def start(self) -> None:
-        """Open the page after the recording has begun: before that, a file of its name would be an older one."""
-        if self._process is not None:
+    def start() -> None:
+        if opened:
             return
         library = ctypes.CDLL(None)
         # In a separate session, the terminal's Ctrl-C does not reach it. The kernel ends it if the scan is killed.
-        self._process = subprocess.Popen(
-            self._command,
+        process = subprocess.Popen(
+            command,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             text=True,
             start_new_session=True,
             preexec_fn=lambda: library.prctl(_SIGNAL_WHEN_PARENT_ENDS, signal.SIGTERM),
         )
-        os.setpriority(os.PRIO_PROCESS, self._process.pid, _POLITE)
-        threading.Thread(target=self._announce, args=(self._process,), daemon=True).start()
+        opened.append(process)
+        os.setpriority(os.PRIO_PROCESS, process.pid, _POLITE)
+        threading.Thread(target=announce, daemon=True).start()
 
-    def _announce(self, process: "subprocess.Popen[str]") -> None:
-        # Further lines are read, so that the pipe does not fill up.
-        for line in process.stdout or ():
-            if line.startswith("open "):
-                self._say(f"{line.split(';')[0]}, while the scan runs")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._process is None:
-            return
-        self._process.terminate()
-        try:
-            self._process.wait(_PATIENCE_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+    try:
+        yield start
+    finally:
+        for process in opened:
+            process.terminate()
+            try:
+                process.wait(_PATIENCE_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
 
 
 class ScanService:
@@ -455,14 +455,8 @@ def _answer(work: Callable[[], str]) -> Callable[[Any, Any], Any]:
 def _import_ros() -> tuple[Any, ...]:
     """Return rclpy, its executors, and the modules of the messages and of the service."""
     try:
-        return (
-            import_module("rclpy"),
-            import_module("rclpy.executors"),
-            import_module("sensor_msgs.msg"),
-            import_module("std_msgs.msg"),
-            import_module("builtin_interfaces.msg"),
-            import_module("std_srvs.srv"),
-        )
+        names = "rclpy", "rclpy.executors", "sensor_msgs.msg", "std_msgs.msg", "builtin_interfaces.msg", "std_srvs.srv"
+        return tuple(import_module(name) for name in names)
     except ImportError as error:
         raise SetupError(
             f"uwlts ros needs ROS 2 for Python, which cannot be imported ({error}): source an installation for "

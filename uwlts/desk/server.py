@@ -47,25 +47,12 @@ def _nicegui() -> FastAPI:
     return app
 
 
-class _FirstError(logging.Handler):
-    """Keep the last line of the first error that the server logs; no other handler gets any."""
-
-    def __init__(self):
-        super().__init__(logging.ERROR)
-        self.text = ""
-        log = logging.getLogger("uvicorn.error")
-        log.handlers, log.propagate = [self], False
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Keep an error."""
-        self.text = self.text or record.getMessage().strip().rpartition("\n")[2]
-
-
 class DeskServer:
     """Server of a page that shows a board, from construction until the ``with`` ends. Only one at a time.
 
     Everybody who opens the ``address`` may view the page. Only the ``operator_address``, which has a token, has
-    controls. ``warning`` is a warning to report if other machines can reach the page, else None.
+    controls. ``warning`` is a warning to report if other machines can reach the page, else None. ``app`` is the
+    application, for further routes.
 
     Parameters
     ----------
@@ -94,10 +81,10 @@ class DeskServer:
         switch: LaserSwitch | None = None,
     ):
         self._access, nicegui, self._switch = PageAccess(host), _nicegui(), switch
-        self._app = FastAPI(**_NO_PAGES, lifespan=nicegui.router.lifespan_context)
+        self.app = FastAPI(**_NO_PAGES, lifespan=nicegui.router.lifespan_context)
         self._add_content(board)
         # Handles all requests that no other route matches.
-        self._app.router.default = nicegui
+        self.app.router.default = nicegui
 
         def show(request: Request) -> None:
             ui.page_title(board.title)
@@ -128,9 +115,13 @@ class DeskServer:
                 )
             self._open = True
             nicegui.state.show = show
-            self._errors = _FirstError()
+            errors: list[str] = []
+            log = logging.getLogger("uvicorn.error")
+            # Nothing is printed, and the first error is kept.
+            log.handlers, log.propagate = [logging.NullHandler()], False
+            log.filters = [lambda record: bool(errors or errors.append(record.getMessage()))]
             config = uvicorn.Config(
-                GuardedApp(self._app, self._access, laser_port=None if switch is None else switch.port),
+                GuardedApp(self.app, self._access, laser_port=None if switch is None else switch.port),
                 http="h11",
                 backlog=BACKLOG,
                 limit_concurrency=_MOST_CONNECTIONS,
@@ -143,38 +134,36 @@ class DeskServer:
             self._server = uvicorn.Server(config)
             self._thread = threading.Thread(target=self._server.run, args=([self._socket],), name="page", daemon=True)
             self._thread.start()
-            self._await_start()
+            deadline = time.monotonic() + _START_S
+            while not self._server.started:
+                if time.monotonic() > deadline or not self._thread.is_alive():
+                    why = errors[0].strip().rpartition("\n")[2] if errors else "no reason is known"
+                    raise SetupError(f"the page's server did not start: {why}")
+                time.sleep(0.02)
         except BaseException:
             if switch is not None:
                 switch.close()
             _ALONE.release()
             raise
 
-    def _await_start(self) -> None:
-        deadline = time.monotonic() + _START_S
-        while not self._server.started:
-            if time.monotonic() > deadline or not self._thread.is_alive():
-                raise SetupError(f"the page's server did not start: {self._errors.text or 'no reason is known'}")
-            time.sleep(0.02)
-
     def _add_content(self, board: Board) -> None:
         """Add the routes for picture, coverage and cloud."""
 
-        @self._app.get("/picture.jpg")
+        @self.app.get("/picture.jpg")
         def picture() -> Response:
             shown = board.picture
             return Response(shown.jpeg if shown else b"", 200 if shown else 204, _LATEST, "image/jpeg")
 
-        @self._app.get("/coverage.png")
+        @self.app.get("/coverage.png")
         def coverage() -> Response:
             shown = board.coverage
             return Response(shown or b"", 200 if shown else 204, _LATEST, "image/png")
 
-        @self._app.get("/cloud")
+        @self.app.get("/cloud")
         def cloud() -> Response:
             return _cloud_answer(board.cloud.points())
 
-        @self._app.get("/cloud/detail")
+        @self.app.get("/cloud/detail")
         def detail(box: str) -> Response:
             look, table = board.detail, None
             with suppress(ValueError, Error):
@@ -182,11 +171,6 @@ class DeskServer:
                 if look is not None and np.isfinite([low, high]).all() and (low < high).all():
                     table = look(low, high)
             return Response(b"", 204, _LATEST) if table is None else _cloud_answer(table)
-
-    @property
-    def app(self) -> FastAPI:
-        """The application, for further routes."""
-        return self._app
 
     def is_operator(self, request: Request) -> bool:
         """Return whether a request is the operator's."""

@@ -48,44 +48,34 @@ class ThinnedCloud:
 
     def __init__(self, at_most: int = 300_000):
         self._lock, self._at_most = threading.Lock(), at_most
-        self._clear()
-        self.version = 0
-
-    def _clear(self) -> None:
-        self._table = np.empty((self._at_most, _COLUMNS))
-        self._count, self._added, self._stride, self.total = 0, 0, 1, 0
+        self.version = -1
+        self.clear()
 
     def clear(self) -> None:
         """Remove all points."""
         with self._lock:
-            self._clear()
+            self._parts, self._kept, self._added, self._stride, self.total = [np.empty((0, _COLUMNS))], 0, 0, 1, 0
             self.version += 1
 
     def add(self, points_mm: np.ndarray, of: int | None = None, **fields: np.ndarray | None) -> None:
         """Add points (N, 3), a sample ``of`` that many, with fields (N,) by the names in `FIELDS`."""
         with self._lock:
-            first = -self._added % self._stride
+            kept = slice(-self._added % self._stride, None, self._stride)
+            known = {name: values[kept] for name, values in fields.items() if values is not None}
+            self._parts.append(point_table(points_mm[kept], **known))
+            self._kept += len(self._parts[-1])
             self._added += len(points_mm)
             self.total += len(points_mm) if of is None else of
-            kept = slice(first, None, self._stride)
-            known = {name: values for name, values in fields.items() if values is not None}
-            table = point_table(points_mm[kept], **{name: values[kept] for name, values in known.items()})
-            while len(table):
-                fitting, table = np.split(table, [self._at_most - self._count])
-                self._table[self._count : self._count + len(fitting)] = fitting
-                self._count += len(fitting)
-                if self._count == self._at_most:
-                    # Keep every second point of both parts, because one stride separates the kept points.
-                    self._stride *= 2
-                    halved = self._table[::2].copy()
-                    self._table[: len(halved)], self._count = halved, len(halved)
-                    table = table[self._at_most % 2 :: 2]
+            while self._kept > self._at_most:
+                self._stride *= 2
+                self._parts = [np.concatenate(self._parts)[::2].copy()]
+                self._kept = len(self._parts[0])
             self.version += 1
 
     def points(self) -> np.ndarray:
         """Return the kept points (N, 7): coordinates in mm, then the fields."""
         with self._lock:
-            return self._table[: self._count].copy()
+            return np.concatenate(self._parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,24 +149,12 @@ class Picture:
             shown[row, column] = _STRIPE
         for u, v in np.rint((np.empty((0, 2)) if self.points is None else self.points) * scale).astype(int).tolist():
             cv2.circle(shown, (u, v), 3, _FOUND, 2, cv2.LINE_AA)
-        return _encode(shown, ".jpg")
+        return cv2.imencode(".jpg", shown)[1].tobytes()
 
     @cached_property
     def histogram(self) -> np.ndarray:
         """Fractions of the pixels in equal intervals of grey value."""
         return np.histogram(self.image, _BINS, (0, self.full_dn + 1))[0] / self.image.size
-
-
-def encode_png(picture: np.ndarray) -> bytes:
-    """Encode a picture (H, W, 3) of uint8 in red, green, blue as PNG."""
-    return _encode(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), ".png")
-
-
-def _encode(picture: np.ndarray, suffix: str) -> bytes:
-    done, data = cv2.imencode(suffix, picture)
-    if not done:
-        raise ValueError(f"a picture of the shape {picture.shape} cannot be encoded as {suffix}")
-    return data.tobytes()
 
 
 @dataclass(frozen=True)
@@ -207,10 +185,10 @@ class Progress:
 class Board:
     """Content of the page; attributes are replaced, never changed in place, and `say` appends to the log.
 
-    ``request`` is what the operator should do, and ``answers`` are the labels of its buttons. ``coverage`` is a PNG of
-    the image area covered in a guided calibration. ``detail`` returns, for a cloud that is shown thinned, the points in
-    a box from low to high (3,) in mm, in the form of `point_table`. ``profile`` is that of the latest laser
-    image, if a calibration is chosen.
+    ``request`` is what the operator should do; its buttons are shown with it. ``coverage`` is a PNG of the image area
+    covered in a guided calibration. ``detail`` returns, for a cloud that is shown thinned, the points in a box from low
+    to high (3,) in mm, in the form of `point_table`. ``profile`` is that of the latest laser image, if a calibration is
+    chosen.
     """
 
     title: str
@@ -220,7 +198,6 @@ class Board:
     picture: Picture | None = None
     pictures: int = 0
     request: str = ""
-    answers: tuple[str, ...] = ()
     coverage: bytes | None = None
     cloud: ThinnedCloud = field(default_factory=ThinnedCloud)
     cloud_name: str = ""

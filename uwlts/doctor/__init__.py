@@ -7,7 +7,7 @@ because a library is broken, that becomes a finding.
 from collections.abc import Callable, Sequence
 from functools import partial
 
-from uwlts.doctor import devices, machine
+from uwlts.doctor import machine
 from uwlts.doctor.machine import Finding, print_findings
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 
@@ -38,15 +38,15 @@ def examine(
         Subject, status, result and advice of each check.
     """
     parts: list[Callable[[], Sequence[Finding]]] = [
-        _examine_libraries,
+        machine.examine_libraries,
         machine.examine_renderer,
-        devices.examine_cameras,
-        devices.examine_ports,
+        machine.examine_cameras,
+        machine.examine_ports,
     ]
     if camera is not None:
-        parts.append(partial(devices.try_camera, camera))
+        parts.append(partial(machine.try_camera, camera))
     if stage is not None:
-        parts.append(partial(devices.try_stage, stage))
+        parts.append(partial(machine.try_stage, stage))
     findings: list[Finding] = []
     for done, part in enumerate(parts):
         progress(done, len(parts))
@@ -60,10 +60,3 @@ def examine(
             )
     progress(len(parts), len(parts))
     return findings
-
-
-def _examine_libraries() -> list[Finding]:
-    # The module needs the library packaging, whose absence is also a finding.
-    from uwlts.doctor import libraries
-
-    return libraries.examine()

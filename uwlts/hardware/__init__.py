@@ -1,1 +1,1 @@
-"""Cameras, stages and lasers: drivers, scans, and guided calibration."""
+"""Cameras, stages and lasers: drivers and scans."""

@@ -9,7 +9,6 @@ import time
 from contextlib import suppress
 from ctypes import POINTER, byref, c_char_p, c_double, c_int, c_int64, c_size_t, c_uint, c_uint16, c_uint64, c_void_p
 from dataclasses import dataclass, replace
-from functools import partial
 from ipaddress import ip_address
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,26 +16,26 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.errors import HardwareError
+from uwlts.errors import HardwareError, ImageError
 from uwlts.files.reading import log_warnings
-from uwlts.hardware.camera_interface import (
-    BUFFERS,
-    CENTRE_LINES,
-    CHUNKS,
-    COORDINATE_BITS,
-    LINE_RATE,
-    LINE_SELECTOR,
-    MONO_BITS,
-    PLAIN,
-    CameraDevice,
-    CameraInfo,
-    CameraSettings,
-    Delivered,
-    Region,
-)
+from uwlts.hardware.camera_interface import CameraDevice, CameraInfo, CameraSettings, Delivered
+from uwlts.model.stripe import Coordinates
 from uwlts.runtime.optional_library import load_aravis
 
 BUFFER_COMPLETE = 0  # ARV_BUFFER_STATUS_SUCCESS
+CENTRE_LINES = "Coord3D_C16"
+"""Pixel format of a 3D camera that extracts the stripe itself (GenICam Pixel Format Naming Convention 2.4)."""
+_LINE_RATE, _LINE_SELECTOR = "AcquisitionLineRate", "ChunkScanLineSelector"
+"""Features of 3D cameras: the profile rate in Hz, and the selector of the profile whose chunk data are read."""
+CHUNKS = ("EncoderValue", "Timestamp")  # requested chunk data; the name of each feature is prefixed with ``Chunk``
+_PLAIN: dict[str, bool | int | float] = dict.fromkeys(["ReverseX", "ReverseY", "LUTEnable", "GammaEnable"], False)
+_PLAIN |= dict.fromkeys(["BinningHorizontal", "BinningVertical", "DecimationHorizontal", "DecimationVertical"], 1)
+_PLAIN |= {"Gamma": 1.0}
+"""Features (GenICam SFNC 2.7) and their values for images as on the image sensor, with grey values linear in light."""
+_BUFFERS = 32  # capacity of the queue of frames: half a second at 60 frames/s; further frames are lost
+_MONO_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono14": 14, "Mono16": 16}
+"""Bit depths of the grey formats. Packed formats are omitted: few cameras offer only them."""
+_COORDINATE_BITS = 16  # bit depth of the values in `CENTRE_LINES`
 
 
 class _GError(ctypes.Structure):
@@ -199,14 +198,28 @@ class AravisCamera(CameraDevice):
                 for part in ("vendor_name", "model_name", "device_serial_number")
             )
             coordinates = self._coordinates() if self._pixel_format() == CENTRE_LINES else None
-            bits = MONO_BITS.get(self._pixel_format(), 8) if coordinates is None else COORDINATE_BITS
+            bits = _MONO_BITS.get(self._pixel_format(), 8) if coordinates is None else _COORDINATE_BITS
             black = self._feature("BlackLevel", float)
         except BaseException:
             self._close()
             raise
         return CameraInfo(f"{maker} {model}", serial, width, height, bits, coordinates, black)
 
+    def _coordinates(self) -> Coordinates:
+        """Return the encoding of a 3D camera's values; raises HardwareError if they are not px of its image sensor."""
+        mode = self._feature("Scan3dOutputMode", str)
+        if mode is not None and not mode.startswith("Uncalibrated"):
+            raise HardwareError(
+                f"the 3D camera {self.address} gives {mode}, which is not in pixels of its image sensor: set its "
+                "Scan3dOutputMode to UncalibratedC, and calibrate it with `uwlts calibrate`"
+            )
+        scale, offset = (self._feature(f"Scan3dCoordinate{name}", float) for name in ("Scale", "Offset"))
+        marked = self._feature("Scan3dInvalidDataFlag", bool)
+        invalid = self._feature("Scan3dInvalidDataValue", float) if marked else None
+        return Coordinates(1.0 if scale is None else scale, offset or 0.0, invalid)
+
     def _feature(self, name: str, kind: type[str] | type[float] | type[int]) -> Any:
+        """Return the value of a camera feature, or None if the camera does not have it."""
         if not self._offers(name):
             return None
         value = self._call(f"get_{_KINDS[kind]}", name.encode())
@@ -214,13 +227,13 @@ class AravisCamera(CameraDevice):
 
     def _set_plain(self) -> None:
         """Switch off what mirrors, bins or bends the images; a calibration is for images without it."""
-        found = {name: self._feature(name, type(plain)) for name, plain in PLAIN.items()}
+        found = {name: self._feature(name, type(plain)) for name, plain in _PLAIN.items()}
         if found["GammaEnable"] is not None:
             # Then Gamma has no effect, and is often locked.
             found["Gamma"] = None
-        changed = {name: value for name, value in found.items() if value not in (None, PLAIN[name])}
+        changed = {name: value for name, value in found.items() if value not in (None, _PLAIN[name])}
         for name, value in changed.items():
-            plain = PLAIN[name]
+            plain = _PLAIN[name]
             with suppress(HardwareError):
                 self._call(f"set_{_KINDS[type(plain)]}", name.encode(), plain)
             if self._feature(name, type(plain)) != plain:
@@ -228,7 +241,7 @@ class AravisCamera(CameraDevice):
                     f"the camera {self.address} has {name} = {value:g}, and does not accept {plain:g}: change it in "
                     "the camera's own program; images must be as on the image sensor, and linear in light"
                 )
-        if said := ", ".join(f"{name} was {value:g} and is now {PLAIN[name]:g}" for name, value in changed.items()):
+        if said := ", ".join(f"{name} was {value:g} and is now {_PLAIN[name]:g}" for name, value in changed.items()):
             log_warnings(self.address, [f"{said}: calibrations of images with the old value do not apply"])
 
     def _offers(self, name: str) -> bool:
@@ -281,36 +294,38 @@ class AravisCamera(CameraDevice):
         self._call("set_acquisition_mode", 0)
         self._call("clear_triggers")
         self._set_plain()
-        region = wanted.region
         if self.info.coordinates is None:
             count = c_uint()
             names = self._call("dup_available_pixel_formats_as_strings", byref(count))
             offered = [names[index].decode() for index in range(count.value)]
             self._functions.g_free(names)
-            self._call("set_pixel_format_from_string", self._grey_format(wanted.bits, offered).encode())
+            name = f"Mono{wanted.bits}"
+            if name not in offered or name not in _MONO_BITS:
+                raise HardwareError(f"the camera {self.address} does not offer {name}, only {', '.join(offered)}")
+            self._call("set_pixel_format_from_string", name.encode())
         self._set_chunks()
-        self._call("set_region", region.x_px, region.y_px, region.width_px, region.height_px)
+        self._call("set_region", 0, 0, self.info.width_px, wanted.rows)
         exposure_us = None if wanted.exposure_ms is None else 1e3 * wanted.exposure_ms
         self._set_number("exposure_time", exposure_us, automatic="exposure")
         self._set_number("gain", wanted.gain_db, automatic="gain")
-        by_lines = self.info.coordinates is not None and self._offers(LINE_RATE)
+        by_lines = self.info.coordinates is not None and self._offers(_LINE_RATE)
         if by_lines and wanted.frame_rate_hz is not None:
-            self._call("set_float", LINE_RATE.encode(), wanted.frame_rate_hz)
+            self._call("set_float", _LINE_RATE.encode(), wanted.frame_rate_hz)
         elif not by_lines:
             self._set_number("frame_rate", wanted.frame_rate_hz)
-        if wanted.trigger != "free":
-            self._call("set_trigger", b"Software" if wanted.trigger == "software" else b"Line0")
+        if wanted.trigger == "software":
+            self._call("set_trigger", b"Software")
         exposure_us, gain, rate = (
             self._call(f"get_{feature}") if self._has(feature) else None
             for feature in ("exposure_time", "gain", "frame_rate")
         )
         if by_lines:
-            rate = self._call("get_float", LINE_RATE.encode())
+            rate = self._call("get_float", _LINE_RATE.encode())
         return CameraSettings(
             exposure_ms=None if exposure_us is None else 1e-3 * exposure_us,
             gain_db=gain,
-            region=Region(*self._numbers("get_region", 4)),
-            bits=MONO_BITS.get(self._pixel_format(), COORDINATE_BITS),
+            rows=self._numbers("get_region", 4)[3],
+            bits=_MONO_BITS.get(self._pixel_format(), _COORDINATE_BITS),
             trigger=wanted.trigger,
             frame_rate_hz=rate,
         )
@@ -323,7 +338,7 @@ class AravisCamera(CameraDevice):
             self._call("set_chunk_mode", 1)
         for each in self._chunks:
             self._call("set_chunk_state", each.encode(), 1)
-        self._by_line = self._offers(LINE_SELECTOR)
+        self._by_line = self._offers(_LINE_SELECTOR)
 
     def _set_number(self, feature: str, value: float | None, *, automatic: str | None = None) -> None:
         if value is None:
@@ -352,7 +367,7 @@ class AravisCamera(CameraDevice):
         payload = self._call("get_payload")
         if functions.arv_camera_is_gv_device(self._camera):
             _enlarge_buffer(functions.arv_gv_stream_get_port(self._stream))
-        for _ in range(BUFFERS):
+        for _ in range(_BUFFERS):
             functions.arv_stream_push_buffer(self._stream, functions.arv_buffer_new(payload, None))
         self._call("start_acquisition")
 
@@ -393,10 +408,44 @@ class AravisCamera(CameraDevice):
             return incomplete
         pixels = (ctypes.c_ubyte * needed).from_address(start)
         image = np.frombuffer(pixels, kind).reshape(height, width).astype(kind.newbyteorder("="))
-        frame, chunk = Delivered(image, number, time_s), partial(self._chunk, buffer)
         if self.info.coordinates is None:
-            return replace(frame, encoder=chunk("ChunkEncoderValue", 0))
-        return self._profiles(image, frame, chunk)
+            return Delivered(image, number, time_s, encoder=self._chunk(buffer, "ChunkEncoderValue", 0))
+        return self._profiles(image, number, time_s, buffer)
+
+    def _profiles(self, numbers: np.ndarray, frame_id: int, time_s: float | None, buffer: int) -> Delivered:
+        """Return the frame of a 3D camera with one centre line for each row of its values (N, W).
+
+        Raises HardwareError if coordinates are outside the profile lines, or the time of a row is unknown.
+        """
+        meant, rows = self.info.coordinates or Coordinates(), range(len(numbers))
+        try:
+            lines = [meant.stripe(each, stripe_along="width", length_px=self.info.height_px) for each in numbers]
+        except ImageError as error:
+            raise HardwareError(f"the 3D camera {self.address}: {error}") from error
+        since_s = [0.0] if len(lines) == 1 else self._since_first(rows, buffer)
+        first, *later = (
+            Delivered(
+                lines[row],
+                frame_id,
+                None if time_s is None else time_s + since_s[row],
+                encoder=self._chunk(buffer, "ChunkEncoderValue", row),
+            )
+            for row in rows
+        )
+        return replace(first, later=tuple(later))
+
+    def _since_first(self, rows: range, buffer: int) -> list[float]:
+        """Return the times in s of a frame's profiles since the first, from their time stamps or the profile rate."""
+        stamps = [each for row in rows if (each := self._chunk(buffer, "ChunkTimestamp", row)) is not None]
+        # Some cameras have only one time stamp per frame.
+        if len(stamps) == len(rows) and stamps[-1] > stamps[0]:
+            return [1e-9 * (each - stamps[0]) for each in stamps]
+        if (rate_hz := self.settings.frame_rate_hz) is None:
+            raise HardwareError(
+                f"the 3D camera {self.address} gives neither a ChunkTimestamp for each profile nor its "
+                "AcquisitionLineRate, so that the times of its profiles are unknown: configure 1 profile per frame"
+            )
+        return [row / rate_hz for row in rows]
 
     def _chunk(self, buffer: int, feature: str, row: int) -> int | None:
         """Return the chunk value that came with a frame, or with one of its profiles, or None."""
@@ -407,7 +456,7 @@ class AravisCamera(CameraDevice):
         functions.arv_gc_set_buffer(functions.arv_device_get_genicam(device), buffer)
         with suppress(HardwareError):
             if self._by_line:
-                self._call("set_integer", LINE_SELECTOR.encode(), row)
+                self._call("set_integer", _LINE_SELECTOR.encode(), row)
             return self._call("get_integer", feature.encode())
         return None
 
@@ -427,7 +476,10 @@ class AravisCamera(CameraDevice):
             complaint = _text(error.contents.message)
             self._functions.g_error_free(error)
             self._gone = self._gone or "timeout" in complaint
-            raise self._make_error(f"'{name.replace('_', ' ')}'", complaint)
+            raise HardwareError(
+                f"the camera {self.address} failed at '{name.replace('_', ' ')}': {complaint}. If it does not answer, "
+                "check power and cable, and whether another program uses it"
+            )
         return result
 
 

@@ -1,4 +1,4 @@
-"""Common interface of all cameras: settings, frames, and the check of every frame.
+"""Common interface of all cameras: settings, frames, and the check of every frame; the replay of images.
 
 A driver implements the methods that begin with an underscore. `CameraDevice` keeps the order of the calls, checks every
 frame and reports faults. `uwlts.hardware.scanning.open_camera` opens a camera by its address. A camera must be
@@ -12,37 +12,23 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any, Literal, Self
+from pathlib import Path
+from typing import Literal, Self
 
 import numpy as np
 
 from uwlts.errors import HardwareError, ImageError
-from uwlts.files.reading import log_warnings
+from uwlts.files.reading import is_regular_file, log_warnings, natural_key
 from uwlts.model.stripe import Coordinates, Stripe
+from uwlts.storage.capture import Capture
+from uwlts.storage.image_file import SUFFIXES, read_image
 
-Trigger = Literal["free", "software", "line"]
+Trigger = Literal["free", "software"]
 
-CENTRE_LINES = "Coord3D_C16"
-"""Pixel format of a 3D camera that extracts the stripe itself (GenICam Pixel Format Naming Convention 2.4)."""
-
-LINE_RATE, LINE_SELECTOR = "AcquisitionLineRate", "ChunkScanLineSelector"
-"""Features of 3D cameras: the profile rate in Hz, and the selector of the profile whose chunk data are read."""
-
-CHUNKS = ("EncoderValue", "Timestamp")  # requested chunk data; the name of each feature is prefixed with ``Chunk``
-
-PLAIN: dict[str, bool | int | float] = dict.fromkeys(["ReverseX", "ReverseY", "LUTEnable", "GammaEnable"], False)
-PLAIN |= dict.fromkeys(["BinningHorizontal", "BinningVertical", "DecimationHorizontal", "DecimationVertical"], 1)
-PLAIN |= {"Gamma": 1.0}
-"""Features (GenICam SFNC 2.7) and their values for images as on the image sensor, with grey values linear in light."""
-
-BUFFERS = 32  # Capacity of a driver's frame queue: half a second at 60 frames/s. Further frames are lost.
-MONO_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono14": 14, "Mono16": 16}
-"""Bit depths of the grey formats. Packed formats are omitted: few cameras offer only them."""
-COORDINATE_BITS = 16  # bit depth of the values in `CENTRE_LINES`
 _WAIT_S = 0.1  # longest single wait in a driver's library, during which Ctrl-C has no effect
 # GigE Vision 1.x counts frames in 16 bits and skips 0.
 _COUNTER_16_BIT = 2**16 - 1
@@ -155,16 +141,6 @@ _MEANING = {
 
 
 @dataclass(frozen=True)
-class Region:
-    """Part of the image sensor that is read out, in px from its upper left pixel."""
-
-    x_px: int
-    y_px: int
-    width_px: int
-    height_px: int
-
-
-@dataclass(frozen=True)
 class CameraInfo:
     """Identity of a camera: name, serial number, size of the image sensor, and bit depth.
 
@@ -186,11 +162,12 @@ class CameraSettings:
     """Camera settings, either requested from a driver or in force.
 
     None in a request leaves a setting unchanged. None in a setting in force means that the camera does not report it.
+    ``rows`` is the height of an image, or the number of profiles in a frame.
     """
 
     exposure_ms: float | None
     gain_db: float | None
-    region: Region
+    rows: int
     bits: int
     trigger: Trigger
     frame_rate_hz: float | None
@@ -300,7 +277,6 @@ class CameraDevice(ABC):
         *,
         exposure_ms: float | None = None,
         gain_db: float | None = None,
-        region: Region | None = None,
         bits: int | None = None,
         trigger: Trigger = "free",
         frame_rate_hz: float | None = None,
@@ -312,10 +288,8 @@ class CameraDevice(ABC):
         ----------
         exposure_ms, gain_db, bits : optional
             Exposure time, gain and bit depth; None leaves the setting unchanged.
-        region : Region, optional
-            Part of the image sensor to read out; None for all of it.
-        trigger : {"free", "software", "line"}
-            Free running, one frame for each call of ``trigger``, or one frame for each pulse at the trigger input.
+        trigger : {"free", "software"}
+            Free running, or one frame for each call of ``trigger``.
         frame_rate_hz : float, optional
             Frame rate of a free-running camera, or profile rate of a 3D camera; None leaves it unchanged.
         profiles : int
@@ -330,18 +304,12 @@ class CameraDevice(ABC):
                 raise HardwareError(f"{name} is {value}: expected a positive number")
         if gain_db is not None and not np.isfinite(gain_db):
             raise HardwareError(f"gain_db is {gain_db}: expected a finite number")
-        region = region or Region(0, 0, info.width_px, info.height_px)
-        right, below = region.x_px + region.width_px, region.y_px + region.height_px
-        inside = min(region.x_px, region.y_px) >= 0 and min(region.width_px, region.height_px) > 0
-        if not inside or right > info.width_px or below > info.height_px:
-            raise HardwareError(f"{region} is not within the image sensor of {info.width_px} x {info.height_px} px")
         if profiles < 1 or (profiles > 1 and (info.coordinates is None or trigger != "free")):
             raise HardwareError(f"profiles is {profiles}: expected 1, or more for a free-running 3D camera")
-        if info.coordinates is not None:
-            region = replace(region, y_px=0, height_px=profiles)
         if bits is None:
             bits = info.bits if self._settings is None else self._settings.bits
-        settings = self._configure(CameraSettings(exposure_ms, gain_db, region, bits, trigger, frame_rate_hz))
+        rows = info.height_px if info.coordinates is None else profiles
+        settings = self._configure(CameraSettings(exposure_ms, gain_db, rows, bits, trigger, frame_rate_hz))
         self._settings = settings if trigger == "free" else replace(settings, frame_rate_hz=None)
         return self._settings
 
@@ -354,7 +322,7 @@ class CameraDevice(ABC):
         settings = self.settings
         if self._started:
             raise HardwareError(f"the camera {self.address} is running already")
-        together = 1 if self.info.coordinates is None else settings.region.height_px
+        together = 1 if self.info.coordinates is None else settings.rows
         period_s = together / settings.frame_rate_hz if settings.frame_rate_hz else None
         self._check = FrameCheck(period_s=period_s, triggered=settings.trigger == "software")
         self._later.clear()
@@ -412,11 +380,10 @@ class CameraDevice(ABC):
     def _make_grabbed_frame(self, frame: Delivered, status: FrameStatus) -> GrabbedFrame:
         settings, seen = self.settings, frame.seen
         assert seen is not None
-        shape = settings.region.height_px, settings.region.width_px
-        if isinstance(seen, np.ndarray) and seen.shape != shape:
+        if isinstance(seen, np.ndarray) and seen.shape != (settings.rows, self.info.width_px):
             raise HardwareError(
                 f"frame {frame.frame_id} of the camera {self.address} has {seen.shape[1]} x {seen.shape[0]} px, "
-                f"expected {settings.region.width_px} x {settings.region.height_px} px"
+                f"expected {self.info.width_px} x {settings.rows} px"
             )
         time_s = time.monotonic() if frame.time_s is None else frame.time_s
         exposure_ms = settings.exposure_ms if frame.exposure_ms is None else frame.exposure_ms
@@ -437,74 +404,10 @@ class CameraDevice(ABC):
             )
         self._answers()
         self._started = True
-        advice = "pulses at its trigger input are missing" if self.settings.trigger == "line" else "its frames are lost"
         return HardwareError(
-            f"the camera {self.address} gave no frame within {timeout_s:g} s though it answers commands: {advice}"
+            f"the camera {self.address} gave no frame within {timeout_s:g} s though it answers commands: its frames "
+            "are lost"
         )
-
-    def _make_error(self, doing: str, error: object) -> HardwareError:
-        """Return the HardwareError for an error of the driver's library."""
-        return HardwareError(
-            f"the camera {self.address} failed at {doing}: {error}. If it does not answer, check power and cable, and "
-            "whether another program uses it"
-        )
-
-    def _grey_format(self, bits: int, offered: Sequence[str]) -> str:
-        """Return the name of the grey pixel format with this bit depth; raises HardwareError if it is not offered."""
-        wanted = f"Mono{bits}"
-        if wanted not in offered or wanted not in MONO_BITS:
-            raise HardwareError(f"the camera {self.address} does not offer {wanted}, only {', '.join(offered)}")
-        return wanted
-
-    def _profiles(self, numbers: np.ndarray, frame: Delivered, chunk: Callable[[str, int], int | None]) -> Delivered:
-        """Return the frame of a 3D camera with one centre line for each row of its values (N, W).
-
-        ``chunk(feature, row)`` returns a row's chunk value, or None. Raises HardwareError if coordinates are outside
-        the profile lines, or the time of a row is unknown.
-        """
-        meant, rows = self.info.coordinates or Coordinates(), range(len(numbers))
-        try:
-            lines = [meant.stripe(each, stripe_along="width", length_px=self.info.height_px) for each in numbers]
-        except ImageError as error:
-            raise HardwareError(f"the 3D camera {self.address}: {error}") from error
-        times_s: list[float | None] = [frame.time_s]
-        if len(lines) > 1:
-            times_s = [None if frame.time_s is None else frame.time_s + each for each in self._since_first(rows, chunk)]
-        delivered = [
-            replace(frame, seen=line, time_s=time_s, encoder=chunk("ChunkEncoderValue", row))
-            for row, line, time_s in zip(rows, lines, times_s, strict=True)
-        ]
-        return replace(delivered[0], later=tuple(delivered[1:]))
-
-    def _since_first(self, rows: range, chunk: Callable[[str, int], int | None]) -> list[float]:
-        """Return the times in s of a frame's profiles since the first, from their time stamps or the profile rate."""
-        stamps = [each for row in rows if (each := chunk("ChunkTimestamp", row)) is not None]
-        # Some cameras have only one time stamp per frame.
-        if len(stamps) == len(rows) and stamps[-1] > stamps[0]:
-            return [1e-9 * (each - stamps[0]) for each in stamps]
-        if (rate_hz := self.settings.frame_rate_hz) is None:
-            raise HardwareError(
-                f"the 3D camera {self.address} gives neither a ChunkTimestamp for each profile nor its "
-                "AcquisitionLineRate, so that the times of its profiles are unknown: configure 1 profile per frame"
-            )
-        return [row / rate_hz for row in rows]
-
-    def _coordinates(self) -> Coordinates:
-        """Return the encoding of a 3D camera's values; raises HardwareError if they are not px of its image sensor."""
-        mode = self._feature("Scan3dOutputMode", str)
-        if mode is not None and not mode.startswith("Uncalibrated"):
-            raise HardwareError(
-                f"the 3D camera {self.address} gives {mode}, which is not in pixels of its image sensor: set its "
-                "Scan3dOutputMode to UncalibratedC, and calibrate it with `uwlts calibrate`"
-            )
-        scale, offset = (self._feature(f"Scan3dCoordinate{name}", float) for name in ("Scale", "Offset"))
-        marked = self._feature("Scan3dInvalidDataFlag", bool)
-        invalid = self._feature("Scan3dInvalidDataValue", float) if marked else None
-        return Coordinates(1.0 if scale is None else scale, offset or 0.0, invalid)
-
-    def _feature(self, name: str, kind: type[str] | type[float] | type[int]) -> Any:
-        """Return the value of a camera feature, or None if the camera does not have it."""
-        return None
 
     def _require_running(self) -> None:
         if not self._started:
@@ -548,3 +451,102 @@ class CameraDevice(ABC):
     @abstractmethod
     def _answers(self) -> None:
         """Raise HardwareError if the camera is gone."""
+
+
+class ReplayCamera(CameraDevice):
+    """Images of a folder in natural order of their names, or of a capture.
+
+    Each trigger, or each request of a free-running replay, delivers the next image at once. Exposures are those of the
+    capture; for a folder, the configured one. A ``grab`` after the last image raises HardwareError.
+    """
+
+    def __init__(self, path: str | Path, *, address: str | None = None):
+        super().__init__(address or f"replay:{path}")
+        self._path = Path(path)
+        self._files: list[Path] = []
+        self._capture: Capture | None = None
+        self._shown = 0
+        self._triggered = False
+
+    def _open(self) -> CameraInfo:
+        self._shown, coordinates = 0, None
+        if self._path.is_dir():
+            images = (path for path in self._path.iterdir() if path.suffix.lower() in SUFFIXES)
+            self._files = sorted(images, key=lambda path: natural_key(path.name))
+            if not self._files:
+                raise HardwareError(f"the folder {self._path} contains no image ({', '.join(SUFFIXES)})")
+            first = _read_image(self._files[0])
+            (height, width), bits = first.shape, 8 * first.itemsize
+        elif is_regular_file(self._path):
+            self._capture = Capture(self._path)
+            if len(self._capture) == 0:
+                self._close()
+                raise HardwareError(f"the capture {self._path} contains no frame")
+            sensor = self._capture.header.sensor
+            height, width, bits = sensor.camera.height_px, sensor.camera.width_px, sensor.detector.bits
+            coordinates = None if self._capture.has_image.all() else Coordinates()
+        else:
+            raise HardwareError(f"{self._path} is neither a folder of images nor a capture")
+        return CameraInfo(f"replay of {self._path.name}", self._path.name, width, height, bits, coordinates)
+
+    def _close(self) -> None:
+        capture, self._capture, self._files = self._capture, None, []
+        if capture is not None:
+            capture.close()
+
+    def _configure(self, wanted: CameraSettings) -> CameraSettings:
+        if wanted.bits != self.info.bits:
+            raise HardwareError(f"{self.address} has images of {self.info.bits} bits, not {wanted.bits}")
+        if wanted.gain_db is not None:
+            raise HardwareError(f"{self.address} has no gain setting: leave gain_db out")
+        exposure_ms = wanted.exposure_ms if self._capture is None else float(self._capture.exposure_ms[0])
+        return replace(wanted, exposure_ms=exposure_ms, frame_rate_hz=None)
+
+    def _start(self) -> None:
+        self._triggered = False
+
+    def _stop(self) -> None:
+        self._triggered = False
+
+    def _trigger(self) -> None:
+        self._triggered = True
+
+    def _next(self, timeout_s: float) -> Delivered | None:
+        if self.settings.trigger == "software":
+            if not self._triggered:
+                time.sleep(timeout_s)
+                return None
+            self._triggered = False
+        self._shown += 1
+        return self._deliver(self._shown - 1)
+
+    def _deliver(self, shown: int) -> Delivered:
+        capture, info, stamp_s = self._capture, self.info, time.monotonic()
+        count = len(self._files) if capture is None else len(capture)
+        if shown >= count:
+            raise HardwareError(f"all {count} images of {self._path} have been shown")
+        seen = _read_image(self._files[shown]) if capture is None else capture.read_observation(shown)
+        exposure_ms = None if capture is None else float(capture.exposure_ms[shown])
+        if isinstance(image := seen, Stripe):
+            known = math.nan if capture is None else float(capture.encoder[shown])
+            return Delivered(seen, shown + 1, stamp_s, exposure_ms, int(known) if math.isfinite(known) else None)
+        if image.shape != (info.height_px, info.width_px) or image.dtype.itemsize != (1 if info.bits == 8 else 2):
+            raise ImageError(
+                f"image {shown} of {self._path} has {image.shape[1]} x {image.shape[0]} px of {image.dtype}, "
+                f"the first one {info.width_px} x {info.height_px} px of {info.bits} bits: give one camera's images"
+            )
+        return Delivered(image, shown + 1, stamp_s, exposure_ms)
+
+    def _answers(self) -> None:
+        """Files need no check: reading a missing one raises an error."""
+
+
+def _read_image(path: Path) -> np.ndarray:
+    """Read a grey image (H, W) of uint8 or uint16; raises ImageError for any other image."""
+    image = read_image(path)
+    if image.ndim != 2:
+        raise ImageError(
+            f"{path} is a colour image, expected a grey image of 8 or 16 bit: "
+            "`uwlts import` converts colour images to a capture, which can be replayed"
+        )
+    return image

@@ -22,7 +22,7 @@ from uwlts.fitting.least_squares import DEFAULT_K, robust_std
 from uwlts.hardware.camera_interface import CameraDevice, GrabbedFrame
 from uwlts.hardware.grbl import GrblStage, StageReport
 from uwlts.hardware.scan_plan import Continuous, ScanPlan
-from uwlts.model.sensor import CaptureHeader, Sensor
+from uwlts.model.sensor import CaptureHeader
 from uwlts.model.stripe import Stripe
 from uwlts.reconstruction.latency import measure_latency
 from uwlts.runtime.progress import ProgressListener, ignore_progress
@@ -40,29 +40,6 @@ _GAP_S = 0.8
 _SLOW_REPORT = 2.0  # reports that took this many times as long as the fastest are ignored: their time is less certain
 _FEWEST_REPORTS = 4  # of the stage's position: two determine the motion, the others check it
 _BUSY = 0.9  # largest fraction of the frame period that the exposure may take
-
-
-@dataclass(frozen=True)
-class FramePlaces:
-    """Assignment of positions to the frames of a continuous scan.
-
-    ``latency_std_s`` is the standard uncertainty of ``latency_s``, or None if the latency was given. ``scatter_s`` is
-    the residual standard deviation of the stage's reports about the fitted line, as a time. ``speeds_mm_per_s`` has one
-    value for each pass.
-    """
-
-    latency_s: float
-    latency_std_s: float | None
-    scatter_s: float
-    speeds_mm_per_s: tuple[float, ...]
-
-    def __str__(self) -> str:
-        known = "as given" if self.latency_std_s is None else f"measured, std {1e3 * self.latency_std_s:.3f} ms"
-        speeds = ", ".join(f"{speed:+.3f}" for speed in self.speeds_mm_per_s)
-        return (
-            f"latency of the stage {1e3 * self.latency_s:+.3f} ms ({known}); its reports scatter by "
-            f"{1e3 * self.scatter_s:.2f} ms; speed {speeds} mm/s"
-        )
 
 
 @dataclass(frozen=True)
@@ -122,8 +99,11 @@ def record_continuously(
     exposure_ms: float,
     overwrite: bool,
     listeners: ScanListeners,
-) -> FramePlaces:
-    """Record the passes of a plan and assign positions to its frames; errors as `uwlts.desk.scan.scan`."""
+) -> str:
+    """Record the passes of a plan, assign positions to its frames, and return a line about latency and speed.
+
+    The errors are those of `uwlts.desk.scan.scan`.
+    """
     sensor, continuous, warn = header.sensor, plan.continuous, listeners.warn
     assert continuous is not None
     positions, passes = plan.stage.positions_mm(), plan_passes(plan, continuous, stage)
@@ -141,7 +121,7 @@ def record_continuously(
     stage.move_to(passes[0][0], feed_mm_per_min=plan.stage.feed_mm_per_min)
     camera.configure(**settings, trigger="software")
     camera.start(faults="skip")
-    clock = _compare_clocks(camera, exposure_ms)
+    offset_s, encoder = _compare_clocks(camera, exposure_ms)
     at_rest_mm = stage.position_mm()
     camera.stop()
     together = continuous.profiles_per_frame
@@ -150,14 +130,16 @@ def record_continuously(
         warn(f"the camera takes {rate_set} frames/s where the plan needs {rate_hz:.4g}: steps differ from the plan's")
     kinds = {"centre_lines": lines, "moving": True}
     with CaptureWriter(out, header, dtype=dtype, **kinds, plan=plan.make_record(), overwrite=overwrite) as writer:
-        reader = _FrameReader(camera, writer, clock, positions, exposure_ms, sensor, header.saturation_dn)
-        reader.frame_s = 1e-3 * exposure_ms + together / rate_hz
-        reader.gap_s = _GAP_S - continuous.speed_mm_per_s / stage.settings.acceleration_mm_per_s2
-        reader.notify = lambda frame, stripe, number: (
-            listeners.counted(stripe),
-            listeners.progress(min(number + 1, expected), expected),
-            listeners.recorded(frame, number),
-        )
+        frame_s, within = 1e-3 * exposure_ms + together / rate_hz, (min(positions), max(positions))
+        braking_s = continuous.speed_mm_per_s / stage.settings.acceleration_mm_per_s2
+
+        def stored(frame: Frame, stripe: Stripe, number: int) -> None:
+            listeners.counted(stripe)
+            listeners.progress(min(number + 1, expected), expected)
+            listeners.recorded(frame, number)
+
+        times = {"frame_s": frame_s, "longest_s": frame_s + _GAP_S - braking_s}
+        reader = _FrameReader(camera, writer, stored, offset_s, exposure_ms, within_mm=within, **times)
         camera.start(faults="skip")
         thread = threading.Thread(target=reader.run, name="continuous-frames", daemon=True)
         feed_mm_per_min = 60 * continuous.speed_mm_per_s
@@ -180,18 +162,11 @@ def record_continuously(
             warn(f"{lost} frames were lost between camera and computer: the steps there are larger")
         ends = sorted(passes[0])
         ramp = _ramp_mm(continuous.speed_mm_per_s, stage)
-        return reader.assign_positions(continuous, (ends[0] + ramp, ends[1] - ramp), at_rest_mm, warn)
+        return reader.assign_positions(continuous, (ends[0] + ramp, ends[1] - ramp), (at_rest_mm, encoder), warn)
 
 
-@dataclass(frozen=True)
-class _Clock:
-    """Offset in s from the camera's time stamps to `time.monotonic`, and the encoder count at rest."""
-
-    offset_s: float
-    encoder: int | None
-
-
-def _compare_clocks(camera: CameraDevice, exposure_ms: float) -> _Clock:
+def _compare_clocks(camera: CameraDevice, exposure_ms: float) -> tuple[float, int | None]:
+    """Return the offset in s from the camera's time stamps to `time.monotonic`, and the encoder count at rest."""
     offsets, encoder = [], None
     for _ in range(_TRIGGERS):
         asked_s = time.monotonic()
@@ -200,7 +175,7 @@ def _compare_clocks(camera: CameraDevice, exposure_ms: float) -> _Clock:
         offsets.append(asked_s - frame.time_s)
         encoder = frame.encoder
     # A delayed time stamp makes the difference too small, never too large.
-    return _Clock(max(offsets), encoder)
+    return max(offsets), encoder
 
 
 class _FrameReader:
@@ -210,26 +185,25 @@ class _FrameReader:
         self,
         camera: CameraDevice,
         writer: CaptureWriter,
-        clock: _Clock,
-        positions: list[float],
+        stored: Callable[[Frame, Stripe, int], None],
+        offset_s: float,
         exposure_ms: float,
-        sensor: Sensor,
-        full_dn: int,
+        *,
+        within_mm: tuple[float, float],
+        frame_s: float,
+        longest_s: float,
     ):
-        self._camera, self._writer, self._clock = camera, writer, clock
-        self._low, self._high = min(positions), max(positions)
-        self._exposure_ms, self._sensor, self._full_dn = exposure_ms, sensor, full_dn
-        self.notify: Callable[[Frame, Stripe, int], object] = lambda frame, stripe, number: None
+        self._camera, self._writer, self._stored = camera, writer, stored
+        self._offset_s, self._exposure_ms, self._within_mm = offset_s, exposure_ms, within_mm
+        self._frame_s, self._longest_s = frame_s, longest_s
         self._passes: list[list[StageReport]] = []
         self._pending: deque[tuple[GrabbedFrame, float]] = deque()
         self._stripes: list[np.ndarray] = []
         self._times: list[float] = []
         self._encoders: list[float] = []
-        self._began_s = time.monotonic()
+        self._began_s, self._heard_s = time.monotonic(), math.inf
         self.end_s: float | None = None
         self.ending = threading.Event()
-        self.frame_s, self.gap_s = 0.0, _GAP_S
-        self._heard_s = math.inf
         self.error: Exception | None = None
 
     def begin_pass(self) -> None:
@@ -242,19 +216,19 @@ class _FrameReader:
         self._passes[-1].append(report)
         if self.error is not None:
             raise self.error
-        if time.monotonic() - self._heard_s > (longest_s := self.frame_s + self.gap_s):
+        if time.monotonic() - self._heard_s > self._longest_s:
             raise HardwareError(
-                f"the camera gave no frame for {longest_s:.2g} s while the laser was on: check power and cable, and "
-                "whether it is fast enough"
+                f"the camera gave no frame for {self._longest_s:.2g} s while the laser was on: check power and cable, "
+                "and whether it is fast enough"
             )
 
     def run(self) -> None:
         """Read frames until one was exposed after the end of the last pass."""
         try:
             while not self.ending.is_set():
-                frame = self._camera.grab(_PATIENCE_S + self.frame_s)
+                frame = self._camera.grab(_PATIENCE_S + self._frame_s)
                 self._heard_s = time.monotonic()
-                middle_s = frame.time_s + self._clock.offset_s + 0.5e-3 * self._exposure_ms
+                middle_s = frame.time_s + self._offset_s + 0.5e-3 * self._exposure_ms
                 self._pending.append((frame, middle_s))
                 self._store_located()
                 if self.end_s is not None and middle_s > self.end_s:
@@ -271,25 +245,31 @@ class _FrameReader:
         while self._pending and (self._pending[0][1] < times[-1] or self.end_s is not None):
             frame, middle_s = self._pending.popleft()
             place = float(np.interp(middle_s, times, places))
-            if not (self._low <= place <= self._high and times[0] <= middle_s <= times[-1]):
+            if not (self._within_mm[0] <= place <= self._within_mm[1] and times[0] <= middle_s <= times[-1]):
                 continue
             encoder = None if frame.encoder is None else float(frame.encoder)
             exposure_ms = self._exposure_ms if frame.exposure_ms is None else frame.exposure_ms
-            stored = Frame(frame.seen, place, True, exposure_ms, middle_s - self._began_s, encoder=encoder)
-            self._writer.append(stored)
-            along = self._sensor.camera.stripe_along
-            stripe = find_stripe(frame.seen, stripe_along=along, saturation=self._full_dn)
+            kept = Frame(frame.seen, place, True, exposure_ms, middle_s - self._began_s, encoder=encoder)
+            self._writer.append(kept)
+            header = self._writer.header
+            along, full_dn = header.sensor.camera.stripe_along, header.saturation_dn
+            stripe = find_stripe(frame.seen, stripe_along=along, saturation=full_dn)
             self._stripes.append(stripe.centre_px)
             self._times.append(middle_s)
             self._encoders.append(np.nan if encoder is None else encoder)
-            self.notify(stored, stripe, len(self._times) - 1)
+            self._stored(kept, stripe, len(self._times) - 1)
 
     def assign_positions(
-        self, continuous: Continuous, even: tuple[float, float], at_rest_mm: float, warn: Callable[[str], None]
-    ) -> FramePlaces:
-        """Assign final positions to all frames, from lines fitted where the speed is constant.
+        self,
+        continuous: Continuous,
+        even: tuple[float, float],
+        at_rest: tuple[float, int | None],
+        warn: Callable[[str], None],
+    ) -> str:
+        """Assign final positions to all frames, from lines fitted where the speed is constant; return a line of text.
 
-        ``even`` is the range of positions in mm with constant speed. Raises HardwareError if no frame shows a stripe,
+        ``even`` is the range of positions in mm with constant speed, ``at_rest`` are position and encoder count before
+        the travel. Raises HardwareError if no frame shows a stripe,
         or if there are too few reports.
         """
         times, centres = np.array(self._times), np.array(self._stripes)
@@ -303,12 +283,19 @@ class _FrameReader:
             own = (times >= _time_of(one[0])) & (times <= _time_of(one[-1])) if one else np.zeros(len(times), bool)
             if not own.any():
                 continue
-            fitted = _fit_line([each for each in one if even[0] <= each.position_mm <= even[1]])
-            stage[own], speed[own] = fitted.position_at(times[own]), fitted.speed
-            scatters.append(fitted.scatter_s)
-            speeds.append(fitted.speed)
+            constant = [each for each in one if even[0] <= each.position_mm <= even[1]]
+            stage[own], speed[own], scatter_s = _fit_line(constant, times[own])
+            scatters.append(scatter_s)
+            speeds.append(float(speed[own][0]))
         if continuous.mm_per_count is not None:
-            stage = self._read_encoder(continuous.mm_per_count, at_rest_mm, continuous.encoder_bits)
+            counts = np.array(self._encoders)
+            if at_rest[1] is None or not np.isfinite(counts).all():
+                raise HardwareError(
+                    "mm_per_count is given, but the camera sends no ChunkEncoderValue with its frames: wire the "
+                    "encoder to it and set its EncoderSource, or leave mm_per_count out"
+                )
+            counts = unwrap_counts(np.append(at_rest[1], counts), continuous.encoder_bits)
+            stage = at_rest[0] + continuous.mm_per_count * (counts[1:] - counts[0])
         latency_s, std_s = 1e-3 * (continuous.latency_ms or 0.0), None
         if continuous.latency_ms is None and continuous.mm_per_count is None:
             if len(speeds) < 2:
@@ -321,39 +308,21 @@ class _FrameReader:
         stage = stage + speed * latency_s
         reports = [(_time_of(each) - self._began_s, each.position_mm) for one in self._passes for each in one]
         self._writer.place(stage, speed, np.array(reports))
-        return FramePlaces(latency_s, std_s, max(scatters), tuple(speeds))
-
-    def _read_encoder(self, mm_per_count: float, at_rest_mm: float, bits: int | None) -> np.ndarray:
-        counts = np.array(self._encoders)
-        if self._clock.encoder is None or not np.isfinite(counts).all():
-            raise HardwareError(
-                "mm_per_count is given, but the camera sends no ChunkEncoderValue with its frames: wire the encoder to "
-                "it and set its EncoderSource, or leave mm_per_count out"
-            )
-        counts = unwrap_counts(np.append(self._clock.encoder, counts), bits)
-        return at_rest_mm + mm_per_count * (counts[1:] - counts[0])
+        known = "as given" if std_s is None else f"measured, std {1e3 * std_s:.3f} ms"
+        return (
+            f"latency of the stage {1e3 * latency_s:+.3f} ms ({known}); its reports scatter by "
+            f"{1e3 * max(scatters):.2f} ms; speed {', '.join(f'{each:+.3f}' for each in speeds)} mm/s"
+        )
 
 
 def _time_of(report: StageReport) -> float:
     return 0.5 * (report.asked_s + report.answered_s)
 
 
-@dataclass(frozen=True)
-class _Line:
-    """Position as a linear function of time, with the scatter of the reports as a time."""
-
-    start_s: float
-    start_mm: float
-    speed: float
-    scatter_s: float
-
-    def position_at(self, times: np.ndarray) -> np.ndarray:
-        return self.start_mm + self.speed * (times - self.start_s)
-
-
-def _fit_line(reports: list[StageReport]) -> _Line:
+def _fit_line(reports: list[StageReport], at_s: np.ndarray) -> tuple[np.ndarray, float, float]:
     """Fit a line to the reports of a pass at constant speed, without slow ones and outliers.
 
+    Return the positions in mm at times (N,) in s, the speed in mm/s, and the scatter of the reports as a time in s.
     Raises HardwareError if there are too few reports.
     """
     if len(reports) < _FEWEST_REPORTS:
@@ -367,16 +336,10 @@ def _fit_line(reports: list[StageReport]) -> _Line:
     used = [each for each in reports if each.answered_s - each.asked_s <= longest]
     times, places = np.array([_time_of(each) for each in used]), np.array([each.position_mm for each in used])
     middle, kept = times.mean(), np.ones(len(used), bool)
-
-    def refit() -> tuple[float, float, np.ndarray]:
+    for _ in range(3):
         speed, start = np.polyfit(times[kept] - middle, places[kept], 1)
-        return float(speed), float(start), places - (start + speed * (times - middle))
-
-    speed, start, away = refit()
-    for _ in range(2):
-        scatter = max(robust_std(away), 1e-6)
-        kept = np.abs(away) <= DEFAULT_K * scatter
-        speed, start, away = refit()
+        away, fitted = places - (start + speed * (times - middle)), kept
+        kept = np.abs(away) <= DEFAULT_K * max(robust_std(away), 1e-6)
     # The line takes two degrees of freedom.
-    scatter = float(np.sqrt((away[kept] ** 2).sum() / max(np.count_nonzero(kept) - 2, 1)))
-    return _Line(float(middle), start, speed, scatter / abs(speed))
+    scatter = float(np.sqrt((away[fitted] ** 2).sum() / max(np.count_nonzero(fitted) - 2, 1)))
+    return start + speed * (at_s - middle), float(speed), scatter / abs(float(speed))

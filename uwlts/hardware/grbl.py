@@ -23,7 +23,6 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Self
 
 from uwlts.errors import HardwareError, RangeError
 from uwlts.hardware.grbl_line import FEED_HOLD, POLL_S, GrblLine, Status, parse_settings
@@ -55,7 +54,7 @@ class StageReport:
     position_mm: float
 
 
-class GrblStage:
+class GrblStage(GrblLine):
     """A stage that is open after construction; a context manager that leaves the laser off. Not thread-safe.
 
     Only `darken` may be called from other threads. ``boot_s`` is the longest start-up time of a controller that
@@ -67,14 +66,13 @@ class GrblStage:
     """
 
     def __init__(self, port: str, *, boot_s: float = 2.5):
-        self._line = GrblLine(port, boot_s=boot_s)
+        super().__init__(port, boot_s=boot_s)
         self._power, self._held = 0.0, False
         self._lighting: tuple[str, ...] = ()
         self.lit_until_s = -math.inf
         try:
-            self.port, self.version = port, self._line.version
-            self.settings = parse_settings(self._line.settings())
-            options, travel = self._line.options(), self.settings.travel_mm
+            self.settings = parse_settings(self.read_settings())
+            options, travel = self.options(), self.settings.travel_mm
             if "V" not in options:
                 raise HardwareError(
                     f"this Grbl's options are {options!r}, without V: the laser needs a firmware with variable spindle"
@@ -83,25 +81,25 @@ class GrblStage:
             self._origin_mm = -travel if self.settings.homing and not zero_at_low_end else 0.0
             self.limits_mm = (0.0, travel) if self.settings.homing else (-travel, travel)
             # A controller with homing is locked until it is homed. A board whose reset is disabled keeps its position.
-            self._position_known = self._line.status().state != "Alarm"
+            self._position_known = self.status().state != "Alarm"
         except BaseException as error:
-            self._line.close(error)
+            self.close(error)
             raise
 
     @property
     def position_known(self) -> bool:
         """True if the stage may move: it was homed or unlocked, and no fault occurred since."""
-        return self._position_known and self._line.fault is None
+        return self._position_known and self.fault is None
 
     @property
     def faulty(self) -> bool:
         """True if a fault has stopped all movements and switched the laser off, until `home` or `unlock`."""
-        return self._line.fault is not None
+        return self.fault is not None
 
     @property
     def laser_power(self) -> float:
         """Power set last; 0 if the laser is off."""
-        return 0.0 if self._line.fault else self._power
+        return 0.0 if self.fault else self._power
 
     def home(self) -> float:
         """Home the stage and return its position in mm; clears a fault and switches the laser off.
@@ -122,7 +120,7 @@ class GrblStage:
         longest_s += 4 * (settings.homing_debounce_ms / 1000 + seek / settings.acceleration_mm_per_s2)
         self._position_known = False
         # No status queries: Grbl does not answer them during homing.
-        self._line.command("$H", timeout_s=_MARGIN * longest_s + _MARGIN_S)
+        self.command("$H", timeout_s=_MARGIN * longest_s + _MARGIN_S)
         self._position_known = True
         return self.position_mm()
 
@@ -132,20 +130,19 @@ class GrblStage:
         Use it if nothing moved (noise on the line at rest, a soft limit) or if there is no limit switch.
         """
         self._recover()
-        self._line.command("$X")
+        self.command("$X")
         self._position_known = True
         return self.position_mm()
 
     def _recover(self) -> None:
-        line = self._line
-        if line.fault is None and not self._held and not line.darkened_by_hand:
+        if self.fault is None and not self._held and not self.darkened_by_hand:
             return
-        self._position_known = self._position_known and line.fault is None and not line.darkened_by_hand
+        self._position_known = self._position_known and self.fault is None and not self.darkened_by_hand
         self._forget_light()
         self._held = False
-        self._line.restart()
+        self.restart()
         # A reset during a movement leaves an alarm.
-        self._position_known = self._position_known and self._line.status().state != "Alarm"
+        self._position_known = self._position_known and self.status().state != "Alarm"
 
     def move_to(self, position_mm: float, *, feed_mm_per_min: float) -> float:
         """Move, wait until the stage is at rest, and return the position read back in mm.
@@ -179,7 +176,7 @@ class GrblStage:
 
         The controller receives the travel part by part. If this program stops, the stage comes to rest and the laser
         goes off within a second. ``reported`` is called with every `StageReport`; an exception from it brakes the
-        stage, which is then held as by `stop`.
+        stage, which is then held until `unlock` or `home`.
 
         Raises RangeError and HardwareError like `move_to` and `laser`. Also raises HardwareError if the next part was
         sent too late for a constant speed.
@@ -202,38 +199,38 @@ class GrblStage:
             in_motion(report)
             at_mm = self._position_of(report)
             brightest = max(brightest, speed if report.spindle is None else report.spindle)
-            reported(StageReport(self._line.asked_s, self._line.answered_s, at_mm))
+            reported(StageReport(self.asked_s, self.answered_s, at_mm))
 
-        self._line.keep_lit()
+        self.announce_light()
         self._power = power
         try:
             # The laser stays off until the stage moves. Grbl rejects G1 without a feed.
-            self._line.command(f"G21G90G94G1F{feed_mm_per_min:.2f}M4S{speed}")
+            self.command(f"G21G90G94G1F{feed_mm_per_min:.2f}M4S{speed}")
             while sent_mm != position_mm:
                 to_mm = at_mm + ahead_mm
                 if abs(to_mm - start_mm) >= abs(position_mm - start_mm):
                     to_mm = position_mm
                 if abs(to_mm - start_mm) > abs(sent_mm - start_mm):
                     self._go(to_mm, feed_mm_per_min)
-                    since_s = time.monotonic() - self._line.asked_s
+                    since_s = time.monotonic() - self.asked_s
                     if sent_mm != start_mm and abs(sent_mm - at_mm) < feed_mm_s * (since_s + ramp_s / 2):
-                        raise self._line.stop_and_make_error(
+                        raise self.stop_and_make_error(
                             f"the stage slowed down near {sent_mm:.2f} mm because this program sent the next part of "
                             "its travel too late: the computer is too busy"
                         )
                     sent_mm = to_mm
                 time.sleep(POLL_S)
-                hear(self._line.status())
+                hear(self.status())
             reached_mm = self._arrive(position_mm, position_mm - at_mm, feed_mm_per_min, hear)
         except BaseException:
             with suppress(HardwareError):
-                self._line.realtime(FEED_HOLD)
+                self.realtime(FEED_HOLD)
             # After a fault the stage has been stopped by a reset.
             self._held = not self.faulty
             raise
         reaches_speed = abs(position_mm - start_mm) > feed_mm_s * (ramp_s + 3 * POLL_S)
         if reaches_speed and brightest < _FULL * speed:
-            raise self._line.stop_and_make_error(
+            raise self.stop_and_make_error(
                 f"the laser's pin does not follow: at most S{brightest:g} is reported, S{speed} was sent: a spindle "
                 "override, or $31 above it"
             )
@@ -252,14 +249,14 @@ class GrblStage:
             )
         if self._held:
             raise HardwareError("the stage is held after a stop: unlock or home it")
-        if not self._position_known and self._line.fault is None:
+        if not self._position_known and self.fault is None:
             raise HardwareError("the stage does not know where it is: home it first")
         if self.laser_power:
             raise HardwareError("the laser is on: switch it off before moving, or use sweep")
         return self.position_mm()
 
     def _go(self, position_mm: float, feed_mm_per_min: float) -> None:
-        self._line.command(f"G21G90G94G53G1X{self._origin_mm + position_mm:.4f}F{feed_mm_per_min:.2f}")
+        self.command(f"G21G90G94G53G1X{self._origin_mm + position_mm:.4f}F{feed_mm_per_min:.2f}")
 
     def _arrive(
         self, position_mm: float, way_mm: float, feed_mm_per_min: float, watch: Callable[[Status], None]
@@ -269,11 +266,11 @@ class GrblStage:
         # Distance at full speed plus two ramps: never less than the real time, however short the distance.
         expected_s = abs(way_mm) / feed_mm_s + feed_mm_s / self.settings.acceleration_mm_per_s2
         # Grbl acknowledges a dwell when all earlier movements are done.
-        self._line.command("G4P0.01", timeout_s=_MARGIN * expected_s + _MARGIN_S, watch=watch)
+        self.command("G4P0.01", timeout_s=_MARGIN * expected_s + _MARGIN_S, watch=watch)
         reached_mm = self._rest()
         missing = round((reached_mm - position_mm) * self.settings.steps_per_mm)
         if abs(missing) > 1:
-            raise self._line.stop_and_make_error(
+            raise self.stop_and_make_error(
                 f"missed steps: the position is {reached_mm:.3f} mm where {position_mm:.3f} mm was requested, "
                 f"{missing:+d} steps; a command or pulses were lost: check the wiring for interference, then home"
             )
@@ -282,7 +279,7 @@ class GrblStage:
     def _motion_watch(self, start_mm: float, feed_mm_s: float) -> Callable[[Status], None]:
         """Return a check of status reports during a movement, for a stall and for states that never end."""
         last_mm, since = start_mm, time.monotonic()
-        patience_s = _STALL_S + _STALL_STEPS * self.settings.step_mm / feed_mm_s
+        patience_s = _STALL_S + _STALL_STEPS / self.settings.steps_per_mm / feed_mm_s
 
         def check(report: Status) -> None:
             nonlocal last_mm, since
@@ -291,7 +288,7 @@ class GrblStage:
             if report.state != "Run" or not math.isclose(position_mm, last_mm, abs_tol=1e-9):
                 last_mm, since = position_mm, now
             elif now - since > patience_s:
-                raise self._line.stop_and_make_error(
+                raise self.stop_and_make_error(
                     f"stall: the stage has been at {position_mm:.3f} mm for {now - since:.1f} s although the "
                     "controller reports that it runs: restart the controller, then home"
                 )
@@ -301,10 +298,10 @@ class GrblStage:
     def _rest(self) -> float:
         """Wait until the controller reports Idle, and return the position in mm."""
         deadline = time.monotonic() + _MARGIN_S
-        while (report := self._line.status()).state != "Idle":
+        while (report := self.status()).state != "Idle":
             self._refuse_stop(report)
             if time.monotonic() > deadline:
-                raise self._line.stop_and_make_error(
+                raise self.stop_and_make_error(
                     f"the controller is in the state {report.state} although its movements are done"
                 )
             time.sleep(POLL_S / 5)
@@ -312,18 +309,18 @@ class GrblStage:
 
     def position_mm(self) -> float:
         """Position in mm as the controller counts it."""
-        return self._position_of(self._line.status())
+        return self._position_of(self.status())
 
     def _position_of(self, report: Status) -> float:
         for _ in range(_REPORTS_TO_OFFSET):
             machine_mm = report.machine_mm
-            if machine_mm is None and report.work_mm is not None and self._line.offset_mm is not None:
-                machine_mm = report.work_mm + self._line.offset_mm
+            if machine_mm is None and report.work_mm is not None and self.offset_mm is not None:
+                machine_mm = report.work_mm + self.offset_mm
             if machine_mm is not None:
                 # The report is rounded to 1 um; the controller counts steps.
                 return round(machine_mm * self.settings.steps_per_mm) / self.settings.steps_per_mm - self._origin_mm
-            report = self._line.status()
-        raise self._line.stop_and_make_error("work positions are reported without their offset (WCO): send $10=1")
+            report = self.status()
+        raise self.stop_and_make_error("work positions are reported without their offset (WCO): send $10=1")
 
     def _refuse_stop(self, report: Status) -> None:
         """Raise HardwareError if the movement cannot end in this state, or the limit switch is pressed elsewhere."""
@@ -337,13 +334,13 @@ class GrblStage:
             "Jog": "jogging",
         }
         if report.state in advice:
-            raise self._line.stop_and_make_error(f"the controller has stopped: {advice[report.state]}")
+            raise self.stop_and_make_error(f"the controller has stopped: {advice[report.state]}")
         if not self.settings.homing or "X" not in report.pins:
             return
         position_mm = self._position_of(report)
         switch_mm = 0.0 if self.settings.homes_to_negative else self.settings.travel_mm
         if abs(position_mm - switch_mm) > self.settings.homing_pull_off_mm + _PIN_MARGIN_MM:
-            raise self._line.stop_and_make_error(
+            raise self.stop_and_make_error(
                 f"missed steps: the limit switch at {switch_mm:g} mm is pressed at the position {position_mm:.3f} mm: "
                 "the motor lost steps (feed or acceleration too high, or an obstacle); home"
             )
@@ -364,33 +361,33 @@ class GrblStage:
         """
         speed = self._speed_of(power)
         # A fault has already switched it off.
-        if self._line.fault is not None and not on:
+        if self.fault is not None and not on:
             return
         if self._lighting:
-            self._line.keep_lit()
-            report = self._line.status()
+            self.announce_light()
+            report = self.status()
             self._refuse_stop(report)
             # The reset would hide a hold, or a light that ended too early. A renewed light blinks.
-            if self._line.answered_s < self.lit_until_s < math.inf:
+            if self.answered_s < self.lit_until_s < math.inf:
                 self._require_spindle(report, self._power)
-            self._line.end()
+            self.end()
         elif not on:
-            self._line.command("M5")
+            self.command("M5")
         if not on or self._lighting:
             self._forget_light()
             self._see_spindle(0.0)
-            self._line.report_dark()
+            self.report_dark()
         if not on:
             return
-        self._line.keep_lit()
+        self.announce_light()
         # In laser mode the pin stays off under G0, the mode after every reset. Grbl rejects G1 without a feed.
-        self._line.command(f"G21G90G94G1F{min(100.0, self.settings.max_feed_mm_per_min):.2f}")
+        self.command(f"G21G90G94G1F{min(100.0, self.settings.max_feed_mm_per_min):.2f}")
         self._power = power
         dwell_s = LIVE_S if at_most_s is None else at_most_s
         # Two lines, not three: if the third were cut off, the laser would stay on.
         self._lighting = f"M3S{speed}G4P{dwell_s:.3f}", "M5"
         self.lit_until_s = time.monotonic() + dwell_s
-        self._line.begin(*self._lighting)
+        self.begin(*self._lighting)
         self._see_spindle(power)
         if at_most_s is None:
             self.lit_until_s = math.inf
@@ -416,12 +413,12 @@ class GrblStage:
         """
         if not self.laser_power:
             return
-        self._line.keep_lit(wait_s)
+        self.announce_light(wait_s)
         if self.lit_until_s == math.inf:
-            self._refuse_stop(self._line.status())
+            self._refuse_stop(self.status())
             # The last light has started.
-            if self._line.unacknowledged <= len(self._lighting):
-                self._line.begin(*self._lighting)
+            if self.unacknowledged <= len(self._lighting):
+                self.begin(*self._lighting)
 
     def _see_spindle(self, power: float) -> None:
         """Check that the pin gets into the expected state, which may take the controller a few ms.
@@ -431,9 +428,9 @@ class GrblStage:
         deadline = time.monotonic() + _LIGHTS_S
         if power:
             deadline = min(deadline, self.lit_until_s)
-        while not self._follows(report := self._line.status(), power) and time.monotonic() < deadline:
+        while not self._follows(report := self.status(), power) and time.monotonic() < deadline:
             time.sleep(POLL_S / 20)
-        if power and self._line.answered_s >= self.lit_until_s:
+        if power and self.answered_s >= self.lit_until_s:
             self._refuse_stop(report)
         else:
             self._require_spindle(report, power)
@@ -444,58 +441,8 @@ class GrblStage:
     def _require_spindle(self, report: Status, power: float) -> None:
         self._refuse_stop(report)
         if not self._follows(report, power):
-            raise self._line.stop_and_make_error(
+            raise self.stop_and_make_error(
                 f"the laser's pin does not follow: S{report.spindle:g} is reported, "
                 f"S{power * self.settings.spindle_max:g} was sent (state {report.state}): a hold, a spindle override, "
                 "or $31 above it"
             )
-
-    def stop(self, *, reset: bool = False) -> float:
-        """Brake to rest by a feed hold and return the position in mm.
-
-        Without ``reset`` the controller is held until `unlock` or `home`. The laser keeps its state, except with $32=1:
-        then Grbl switches it off. With ``reset`` the laser goes off and the stage can move again; the position is kept
-        because nothing moves during the reset.
-        """
-        self._line.realtime(FEED_HOLD)
-        braking_s = self.settings.max_feed_mm_per_min / 60 / self.settings.acceleration_mm_per_s2
-        deadline = time.monotonic() + _MARGIN * braking_s + _MARGIN_S
-        # Hold:1 is braking, Hold:0 is at rest.
-        while (report := self._line.status()).state in ("Run", "Hold", "Jog") and report.substate != 0:
-            if time.monotonic() > deadline:
-                raise self._line.stop_and_make_error(
-                    f"the stage does not stop after a feed hold, its state is {report.state}"
-                )
-            time.sleep(POLL_S / 5)
-        self._held = True
-        if reset:
-            self._recover()
-        return self.position_mm()
-
-    @property
-    def descriptor(self) -> int:
-        """File descriptor of the serial port, for another process that switches the laser off by Ctrl-X."""
-        return self._line.descriptor
-
-    @property
-    def laser_unreachable(self) -> bool:
-        """True if the last command to switch the laser off could not be sent."""
-        return self._line.unreachable
-
-    def darken(self) -> bool:
-        """Switch the laser off by Ctrl-X, from any thread and in any state, which also stops a movement.
-
-        Returns whether the command could be sent. A call in progress fails at its next exchange with the controller.
-        Afterwards use `unlock` if nothing moved, or `home`.
-        """
-        return self._line.darken()
-
-    def close(self, error: BaseException | None = None) -> None:
-        """Switch the laser off and close the port; raises HardwareError if the controller does not confirm."""
-        self._line.close(error)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        self.close(error)

@@ -25,7 +25,7 @@ except ImportError:
     termios = None  # Windows, where no stage can be used
 
 _NUMBER = r"-?\d+(?:\.\d+)?"
-_STATE = re.compile(r"(Idle|Run|Hold|Jog|Alarm|Door|Check|Home|Sleep)(?::(\d+))?")
+_STATE = re.compile(r"(Idle|Run|Hold|Jog|Alarm|Door|Check|Home|Sleep)(?::\d+)?")
 _COORDINATES = re.compile(rf"{_NUMBER}(?:,{_NUMBER})*")
 
 ReplyKind = Literal["ok", "error", "ALARM", "banner", "setting", "message", "garbage"]
@@ -66,7 +66,6 @@ class Status:
     """
 
     state: str
-    substate: int | None = None
     machine_mm: float | None = None
     work_mm: float | None = None
     offset_mm: float | None = None
@@ -94,7 +93,6 @@ def _parse_status(body: str) -> Status | None:
     x = {name: float(values.split(",")[0]) for name, values in numbers.items()}
     return Status(
         state=state[1],
-        substate=int(state[2]) if state[2] else None,
         machine_mm=x.get("MPos"),
         work_mm=x.get("WPos"),
         offset_mm=x.get("WCO"),
@@ -122,11 +120,6 @@ class GrblSettings:
     homing_pull_off_mm: float
     spindle_max: float
     laser_mode: bool
-
-    @property
-    def step_mm(self) -> float:
-        """Smallest movement in mm."""
-        return 1 / self.steps_per_mm
 
 
 def parse_settings(values: Mapping[int, float]) -> GrblSettings:
@@ -160,9 +153,8 @@ def parse_settings(values: Mapping[int, float]) -> GrblSettings:
 
 def code_text(kind: Literal["error", "ALARM"], number: int) -> str:
     """Return the meaning of an ``error:N`` or ``ALARM:N``, with advice if the operator can do something."""
-    if kind == "error":
-        return f"error:{number}, {_ERRORS.get(number, 'unknown to Grbl 1.1')}"
-    return f"ALARM:{number}, {_ALARMS.get(number, 'unknown to Grbl 1.1; reset the controller and home')}"
+    known, advice = (_ERRORS, "") if kind == "error" else (_ALARMS, "; reset the controller and home")
+    return f"{kind}:{number}, {known.get(number, f'unknown to Grbl 1.1{advice}')}"
 
 
 _ALARMS = {
@@ -244,6 +236,8 @@ _ASKED_TO_DARKEN = "the laser was switched off by hand: unlock the stage if it s
 class GrblLine:
     """Open line to a controller of version 1.1, which has just restarted. Not thread-safe, apart from `darken`.
 
+    The ``with`` ends with the laser off. ``laser_unreachable``: the last command to switch it off could not be sent.
+
     ``port`` is a serial port such as /dev/ttyACM0. ``boot_s`` is the longest time to the greeting of a controller that
     restarts when the port is opened; after that Ctrl-X requests the greeting. Raises HardwareError if the port is
     missing, forbidden or in use, nothing answers, or the answer is not that of Grbl 1.1.
@@ -258,7 +252,7 @@ class GrblLine:
         self._serial = _open_port(port)
         self._guard: Heartbeat | None = None
         self._lit, self._beaten_s = False, -math.inf
-        self.darkened_by_hand, self._writing, self.unreachable = False, threading.Lock(), False
+        self.darkened_by_hand, self._writing, self.laser_unreachable = False, threading.Lock(), False
         try:
             self._hang_up_on_close()
             self._guard = Heartbeat(self._serial.fileno())
@@ -281,7 +275,7 @@ class GrblLine:
         except termios.error as error:
             raise HardwareError(f"the serial port cannot be set up: {error}") from error
 
-    def keep_lit(self, wait_s: float = 0.0) -> None:
+    def announce_light(self, wait_s: float = 0.0) -> None:
         """Tell the guard that the laser is on, or about to be, and that the next beat may take ``wait_s``.
 
         Every exchange with the controller sends a beat. Raises HardwareError if the guard process is gone, or has
@@ -292,7 +286,7 @@ class GrblLine:
         self._beat(wait_s + GRACE_S)
 
     def report_dark(self) -> None:
-        """Tell the guard that the laser is off; raises HardwareError like `keep_lit` if it was on before."""
+        """Tell the guard that the laser is off; raises HardwareError like `announce_light` if it was on before."""
         if self._lit:
             self._beat(math.inf)
             self._lit = False
@@ -373,7 +367,7 @@ class GrblLine:
         if (alarm := self._reset()) is not None:
             raise self.stop_and_make_error(code_text("ALARM", alarm))
 
-    def settings(self) -> dict[int, float]:
+    def read_settings(self) -> dict[int, float]:
         """Return the answer to ``$$``: values by number."""
         return {each.number: each.value for each in self.command("$$") if each.kind == "setting"}
 
@@ -406,13 +400,14 @@ class GrblLine:
 
     @property
     def descriptor(self) -> int:
-        """File descriptor of the open port."""
+        """File descriptor of the open port, for another process that switches the laser off by Ctrl-X."""
         return self._serial.fileno()
 
     def darken(self) -> bool:
-        """Send Ctrl-X from any thread, without waiting for an answer; return whether it could be sent.
+        """Switch the laser off by Ctrl-X, from any thread and in any state, which also stops a movement.
 
-        Until `restart` nothing else is sent: a call in progress fails at its next exchange.
+        Returns whether the command could be sent, without waiting for an answer. Until `restart` nothing else is sent:
+        a call in progress fails at its next exchange. Afterwards unlock a stage if nothing moved, or home it.
         """
         self.darkened_by_hand = True
         # Only for a short time: a write that hangs must not delay the reset.
@@ -424,11 +419,11 @@ class GrblLine:
                 self._writing.release()
 
     def _send_reset(self) -> bool:
-        self.unreachable = True
+        self.laser_unreachable = True
         with suppress(OSError):
             self._serial.write(SOFT_RESET)
-            self.unreachable = False
-        return not self.unreachable
+            self.laser_unreachable = False
+        return not self.laser_unreachable
 
     def restart(self) -> None:
         """Reset by Ctrl-X: the laser goes off and a fault is cleared; the position is kept only if nothing moved."""

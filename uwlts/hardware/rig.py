@@ -230,16 +230,8 @@ class Rig:
             self._position_mm = position_mm
         return self._read_back_mm
 
-    def image(self, light: Light, exposure_ms: float) -> tuple[np.ndarray, float]:
-        """Take an image (H, W) in a light, "lamp" being without laser; return it with its exposure in ms.
-
-        Raises HardwareError if the camera delivers centre lines.
-        """
-        frame = self.frame(light, exposure_ms)
-        return frame.image, exposure_ms if frame.exposure_ms is None else frame.exposure_ms
-
     def frame(self, light: Light, exposure_ms: float) -> GrabbedFrame:
-        """Take a frame in a light: an image or a centre line."""
+        """Take a frame in a light, "lamp" being without laser: an image or a centre line."""
         if self._exposure_ms is None or abs(self._exposure_ms / exposure_ms - 1) >= 1e-6:
             self._rest()
             camera, gain_db, bits = self._camera, self._plan.gain_db, self._sensor.detector.bits
@@ -252,7 +244,10 @@ class Rig:
     def find_exposure(self, light: Light, *, start_ms: float) -> float | None:
         """Find the exposure in ms for the present scene; None if even the longest is too dark."""
         return find_exposure(
-            lambda exposure_ms: self.image(light, exposure_ms)[0], sensor=self._sensor, light=light, start_ms=start_ms
+            lambda exposure_ms: self.frame(light, exposure_ms).image,
+            sensor=self._sensor,
+            light=light,
+            start_ms=start_ms,
         )
 
     def _laser(self, on: bool) -> None:

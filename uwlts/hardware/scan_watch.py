@@ -1,10 +1,5 @@
 """Checks of a running scan by its images: whether the laser emits light and whether the stage has lost steps.
 
-Laser: an image without a stripe may be correct, before or after the object. If the stripe is missing, or much smaller
-than in the previous image, an image with the laser off is taken. If both show the same, the stage returns to where the
-stripe was last seen. If the stripe is there, the scan continues; if not, the laser has failed. A scan that has not yet
-seen a stripe searches for one at positions over the whole plan.
-
 Stage: the controller counts pulses, not motor steps. On an object with relief along the motion, the stripe moves
 through the image as the stage moves; neighbouring images give the rate in px per mm. An early position is revisited at
 the end: the stripe's displacement divided by that rate is the stage's error.
@@ -15,16 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwlts.errors import HardwareError
 from uwlts.fitting.least_squares import robust_std
-from uwlts.hardware.rig import Rig, are_enough, get_stripe
+from uwlts.hardware.rig import are_enough, get_stripe
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Seen
 from uwlts.stripe import Stripe, StripeStatus
 
 LOOKS = 9  # number of positions searched for a stripe before a scan is given up
-_DROP = 0.5  # a stripe whose number of lines or level is below this fraction of the previous image's is checked
-_AGAIN = 25  # number of images without a stripe after which the laser is checked again
 _SAME_PX = 1.0  # stripes of two images within this distance are the same; edges caused by noise are displaced more
 _ITS_OWN = 0.5  # smallest fraction of the stripe's height that vanishes when the laser is switched off
 
@@ -65,67 +57,6 @@ class LitPlace:
     exposure_ms: float
 
 
-class LaserWatch:
-    """Check of every laser image of a scan.
-
-    ``lit`` is a place where the stripe is known to be visible; ``difference`` is that of `shows_laser`.
-    """
-
-    def __init__(self, rig: Rig, sensor: Sensor, positions_mm: Sequence[float], *, difference: bool):
-        self._rig, self._sensor, self._difference = rig, sensor, difference
-        self._positions_mm = positions_mm
-        self.lit: LitPlace | None = None
-        self._usual: tuple[int, float] | None = None
-        self._without = 0
-
-    def check(
-        self, image: Seen, stripe: Stripe, level: float, here: LitPlace, *, unlit: np.ndarray | None, last: bool
-    ) -> None:
-        """Check that the laser emitted light in an image or centre line, before it is stored. The stage may move.
-
-        ``level`` is the brightness of the stripe, which is compared with that of the image before. ``unlit`` (H, W) is
-        an image without laser at the same position; if missing, it is taken when it is needed. No further image follows
-        the ``last``. Raises HardwareError if the laser emits no light.
-        """
-        now = (int((stripe.status != StripeStatus.NO_STRIPE).sum()), level)
-        if self._usual is None or any(a < _DROP * b for a, b in zip(now, self._usual, strict=True)):
-            dark = self._rig.frame("lamp", here.exposure_ms).seen if unlit is None else unlit
-            if not shows_laser(image, dark, self._sensor, difference=self._difference):
-                self._without += 1
-                if last or self._without % _AGAIN == 1:
-                    self._look_elsewhere(here)
-                return
-        self._usual, self.lit, self._without = now, here, 0
-
-    def _look_elsewhere(self, here: LitPlace) -> None:
-        """Look for the stripe where it was seen, or over the whole plan; raises HardwareError if it is nowhere."""
-        others = [position for position in select_evenly(self._positions_mm, LOOKS) if position != here.position_mm]
-        for place in [self.lit] if self.lit else [LitPlace(position, here.exposure_ms) for position in others]:
-            self._rig.move_to(place.position_mm)
-            lit, unlit = (self._rig.frame(light, place.exposure_ms).seen for light in ("laser", "lamp"))
-            if shows_laser(lit, unlit, self._sensor, difference=self._difference):
-                self.lit = place
-                self._rig.move_to(here.position_mm)
-                return
-        if self.lit is None:
-            raise self.no_light(here.exposure_ms)
-        passed = self._without - 1
-        also = f"; the {passed} images before this one have no stripe either" if passed else ""
-        raise HardwareError(
-            f"the laser has failed: at {self.lit.position_mm:g} mm, where its stripe was seen before, images with the "
-            f"laser on and off show the same{also}. Check its supply, key and interlock, then continue with `resume`"
-        )
-
-    def no_light(self, exposure_ms: float) -> HardwareError:
-        """Return the error for a scan that sees no stripe anywhere."""
-        looked = select_evenly(self._positions_mm, LOOKS)
-        return HardwareError(
-            f"no laser light at any of {len(looked)} positions from {looked[0]:g} to {looked[-1]:g} mm, exposed by "
-            f"{exposure_ms:.3g} ms: images with the laser on and off show the same. Is the laser on (supply, key, "
-            "interlock), the object in the volume, the lens cap off?"
-        )
-
-
 LARGEST_MM = 0.05  # largest slip that is not reported: four steps of 0.0125 mm, comparable with the sensor's errors
 _LEAST_RELIEF = 0.2
 """Smallest motion of the stripe in px per mm of the stage on lines that are used; below it noise dominates."""
@@ -142,23 +73,42 @@ class Place(LitPlace):
     centre_px: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class Relief:
-    """A place whose image shows the stage's position: ``motion_px_per_mm`` (N,), NaN on lines without relief."""
+class SlipWatch:
+    """Search for the earliest laser image of a scan that shows the stage's position, and the stage's slip in it.
 
-    place: Place
-    motion_px_per_mm: np.ndarray
+    ``place`` is that image, or None if none has enough relief.
+    """
+
+    def __init__(self) -> None:
+        self.place: Place | None = None
+        self._motion_px_per_mm = np.empty(0)  # (N,), NaN on lines without relief
+        self._latest: list[Place] = []
+
+    def add(self, place: Place) -> None:
+        """Consider an image; the middle one of three has enough relief if its error is a third of `LARGEST_MM`."""
+        self._latest = [*self._latest[-2:], place]
+        if self.place is not None or len(self._latest) < 3:
+            return
+        before, here, after = self._latest
+        motion = (after.centre_px - before.centre_px) / (after.position_mm - before.position_mm)
+        bend = after.centre_px - 2 * here.centre_px + before.centre_px
+        with np.errstate(invalid="ignore"):
+            steep = (np.abs(motion) > _LEAST_RELIEF) & (np.abs(bend) < _LARGEST_BEND_PX)
+        # The bend has six times the variance of a centre, and a slip twice that variance.
+        if steep.sum() >= _FEWEST_LINES and _standard_error(bend[steep] / np.sqrt(3), motion[steep]) <= LARGEST_MM / 3:
+            self.place, self._motion_px_per_mm = here, np.where(steep, motion, np.nan)
 
     def measure_slip(self, again: np.ndarray) -> tuple[float, float]:
         """Return the stage's displacement in mm from new centres (N,) in px at this place, and its standard error.
 
         Both are infinite if too few lines remain.
         """
+        assert self.place is not None
         away = again - self.place.centre_px
-        good = np.isfinite(away) & np.isfinite(self.motion_px_per_mm)
+        good = np.isfinite(away) & np.isfinite(self._motion_px_per_mm)
         if good.sum() < _FEWEST_LINES:
             return np.inf, np.inf
-        motion, away = self.motion_px_per_mm[good], away[good]
+        motion, away = self._motion_px_per_mm[good], away[good]
         # The weighted median is robust to lines that now show another stripe.
         slips, weights = away / motion, np.abs(motion)
         order = np.argsort(slips)
@@ -167,39 +117,13 @@ class Relief:
         return slip_mm, _standard_error(away - slip_mm * motion, motion)
 
     def is_significant(self, slip_mm: float, error_mm: float) -> bool:
-        """Return whether the slip exceeds `LARGEST_MM` and its uncertainty."""
+        """Return whether a slip exceeds `LARGEST_MM` and its uncertainty."""
         return np.isfinite(slip_mm) and abs(slip_mm) > max(LARGEST_MM, _SIGMAS * error_mm)
-
-
-class SlipWatch:
-    """Search for the earliest laser image of a scan with enough ``relief`` to determine the stage's position."""
-
-    def __init__(self) -> None:
-        self.relief: Relief | None = None
-        self._latest: list[Place] = []
-
-    def add(self, place: Place) -> None:
-        """Consider an image."""
-        self._latest = [*self._latest[-2:], place]
-        if self.relief is None and len(self._latest) == 3:
-            self.relief = _measure_relief(*self._latest)
 
 
 def select_centres(stripe: Stripe) -> np.ndarray:
     """Return the centres (N,) in px of the lines with one stripe, NaN on the others."""
     return np.where(stripe.status == StripeStatus.OK, stripe.centre_px, np.nan)
-
-
-def _measure_relief(before: Place, here: Place, after: Place) -> Relief | None:
-    """Measure the relief of the middle place; None if its uncertainty exceeds a third of `LARGEST_MM`."""
-    motion = (after.centre_px - before.centre_px) / (after.position_mm - before.position_mm)
-    bend = after.centre_px - 2 * here.centre_px + before.centre_px
-    with np.errstate(invalid="ignore"):
-        steep = (np.abs(motion) > _LEAST_RELIEF) & (np.abs(bend) < _LARGEST_BEND_PX)
-    # The bend has six times the variance of a centre, and a slip twice that variance.
-    if steep.sum() < _FEWEST_LINES or _standard_error(bend[steep] / np.sqrt(3), motion[steep]) > LARGEST_MM / 3:
-        return None
-    return Relief(here, np.where(steep, motion, np.nan))
 
 
 def _standard_error(scatter_px: np.ndarray, motion_px_per_mm: np.ndarray) -> float:

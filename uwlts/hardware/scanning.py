@@ -14,24 +14,14 @@ import numpy as np
 
 from uwlts.errors import DescriptionError, HardwareError
 from uwlts.hardware.aravis import AravisCamera
-from uwlts.hardware.camera_interface import CameraDevice
+from uwlts.hardware.camera_interface import CameraDevice, ReplayCamera
 from uwlts.hardware.continuous import ScanListeners, plan_passes, record_continuously
 from uwlts.hardware.grbl import GrblStage
-from uwlts.hardware.replay import ReplayCamera
 from uwlts.hardware.rig import START_MS, Brightness, Rig, add_provenance, get_stripe, measure_brightness
 from uwlts.hardware.scan_plan import Light, ScanPlan
-from uwlts.hardware.scan_watch import (
-    LOOKS,
-    LaserWatch,
-    LitPlace,
-    Place,
-    SlipWatch,
-    select_centres,
-    select_evenly,
-    shows_laser,
-)
+from uwlts.hardware.scan_watch import LOOKS, LitPlace, Place, SlipWatch, select_centres, select_evenly, shows_laser
 from uwlts.model.sensor import Sensor
-from uwlts.storage.capture import Capture, Frame, part_path
+from uwlts.storage.capture import Capture, Frame, Seen, part_path
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.import_.grey_values import subtract_background
 from uwlts.stripe import Stripe, StripeStatus
@@ -64,6 +54,8 @@ def open_camera(address: str) -> CameraDevice:
 
 _FAINT = 0.1  # laser images below this fraction of full scale are reported as faint
 _EXPOSED_AT = 5  # number of positions, evenly distributed over a plan, used by automatic exposure
+_DROP = 0.5  # a stripe whose number of lines or level is below this fraction of the previous image's is checked
+_AGAIN = 25  # number of images without a stripe after which the laser is checked again
 
 
 @dataclass
@@ -84,19 +76,15 @@ class ScanProgress:
 
     def warnings(self) -> list[str]:
         """Return warnings for the operator."""
-        texts = []
-        if self.saturated:
-            texts.append(f"{self.saturated} laser images are saturated on many lines: shorten laser_ms")
-        if self.faint:
-            texts.append(f"{self.faint} laser images are faint: lengthen laser_ms, or is the laser off?")
-        if self.lines and self.found < 0.05 * self.lines:
-            texts.append(
-                f"only {self.found} of {self.lines} profile lines show a stripe: is the laser on, the object "
-                "in the volume?"
-            )
-        if self.repeated:
-            texts.append(f"{self.repeated} images were lost between camera and computer and taken again")
-        return texts
+        few = self.found < 0.05 * self.lines
+        texts = {
+            f"{self.saturated} laser images are saturated on many lines: shorten laser_ms": self.saturated,
+            f"{self.faint} laser images are faint: lengthen laser_ms, or is the laser off?": self.faint,
+            f"only {self.found} of {self.lines} profile lines show a stripe: is the laser on, the object in the "
+            "volume?": few,
+            f"{self.repeated} images were lost between camera and computer and taken again": self.repeated,
+        }
+        return [text for text, found in texts.items() if found]
 
 
 def record_scan(
@@ -133,17 +121,22 @@ def record_scan(
         images=len(shots),
         background=plan.background,
     )
-    if plan.continuous is not None:
-        if resume:
-            raise DescriptionError("a continuous scan cannot be resumed: give `overwrite` to scan again")
-        plan_passes(plan, plan.continuous, stage)
+
+    def begin(seen: ScanProgress) -> _Taking:
         rig = Rig(plan, plan.stage, sensor, camera, stage, ahead=plan.stage.step_mm)
-        seen = ScanProgress()
         taking = _Taking(plan, sensor, rig, seen, listeners.warn)
         report("finding the exposures")
         taking.settle_exposures(between)
         report("recording")
-        placed = record_continuously(
+        return taking
+
+    if plan.continuous is not None:
+        if resume:
+            raise DescriptionError("a continuous scan cannot be resumed: give `overwrite` to scan again")
+        plan_passes(plan, plan.continuous, stage)
+        seen = ScanProgress()
+        taking = begin(seen)
+        line = record_continuously(
             plan,
             out,
             camera=camera,
@@ -153,7 +146,7 @@ def record_scan(
             overwrite=overwrite,
             listeners=replace(listeners, counted=taking.count_stripe),
         )
-        report(f"{placed}")
+        report(line)
         return seen
     known_ms, before_s = read_unfinished(out, [multiple for _, multiple in plan.images()]) if resume else ({}, 0.0)
     seen = ScanProgress(exposure_ms=known_ms)
@@ -162,11 +155,7 @@ def record_scan(
         begun = len(writer)
         if begun == len(shots):
             return seen
-        rig = Rig(plan, plan.stage, sensor, camera, stage, ahead=plan.stage.step_mm)
-        taking = _Taking(plan, sensor, rig, seen, listeners.warn)
-        report("finding the exposures")
-        taking.settle_exposures(between)
-        report("recording")
+        taking = begin(seen)
         start_s = time.monotonic() - before_s
         for done, (position_mm, (light, multiple)) in enumerate(shots[begun:], begun + 1):
             between()
@@ -232,13 +221,21 @@ def check_lines_plan(plan: ScanPlan) -> None:
 
 
 class _Taking:
-    """Images of a scan, with exposures settled before the first one of each light."""
+    """Images of a scan, with exposures settled before the first one of each light, and checks of laser and stage.
+
+    An image without a stripe may be correct, before or after the object. If the stripe is missing, or much smaller than
+    in the previous image, an image with the laser off is taken. If both show the same, the stage returns to where the
+    stripe was last seen. If the stripe is there, the scan continues; if not, the laser has failed. A scan that has not
+    yet seen a stripe searches for one at positions over the whole plan.
+    """
 
     def __init__(self, plan: ScanPlan, sensor: Sensor, rig: Rig, seen: ScanProgress, warn: Callable[[str], None]):
         self._plan, self._sensor, self._rig, self._seen, self._warn = plan, sensor, rig, seen, warn
         self._positions_mm = plan.stage.positions_mm()
-        self._watch = LaserWatch(rig, sensor, self._positions_mm, difference=plan.background)
         self._slip = SlipWatch()
+        self._lit: LitPlace | None = None
+        self._usual: tuple[int, float] | None = None
+        self._without = 0
 
     def settle_exposures(self, between: Callable[[], None]) -> None:
         """Set the planned exposures, or the shortest that is needed at positions over the whole plan."""
@@ -259,14 +256,14 @@ class _Taking:
             if light not in exposures:
                 longest_ms = self._sensor.exposure.longest_ms
                 if light == "laser":
-                    raise self._watch.no_light(longest_ms)
+                    raise self._no_light(longest_ms)
                 exposures[light] = longest_ms
 
     def _settle(self, light: Light, position_mm: float) -> None:
         """Shorten the exposure of a light if it is too long here; find it if nothing was seen in this light before."""
         exposures = self._seen.exposure_ms
         if light in exposures:
-            here = measure_brightness(self._rig.image(light, exposures[light])[0], self._sensor, light)
+            here = measure_brightness(self._rig.frame(light, exposures[light]).image, self._sensor, light)
             if here.level <= self._sensor.exposure.auto_level:
                 return
         exposure_ms = self._rig.find_exposure(light, start_ms=exposures.get(light, START_MS))
@@ -274,10 +271,10 @@ class _Taking:
             return
         if light == "laser":
             # Daylight on an object's edges can look like a stripe at long exposures.
-            lit, unlit = (self._rig.image(each, exposure_ms)[0] for each in ("laser", "lamp"))
-            if not shows_laser(lit, unlit, self._sensor, difference=self._plan.background):
+            lit, unlit = (self._rig.frame(each, exposure_ms).image for each in ("laser", "lamp"))
+            if not self._shows_laser(lit, unlit):
                 return
-            self._watch.lit = LitPlace(position_mm, exposure_ms)
+            self._lit = LitPlace(position_mm, exposure_ms)
         exposures[light] = min(exposure_ms, exposures.get(light, exposure_ms))
 
     def take(self, position_mm: float, light: Light, multiple: float, *, last: bool) -> Frame:
@@ -300,11 +297,11 @@ class _Taking:
             frame = rig.frame(light, asked_ms)
             bright = measure_brightness(frame.seen, self._sensor, light)
         image, exposure_ms = frame.seen, asked_ms if frame.exposure_ms is None else frame.exposure_ms
-        unlit = rig.image("lamp", exposure_ms)[0] if zero_dn and light == "laser" else None
+        unlit = rig.frame("lamp", exposure_ms).image if zero_dn and light == "laser" else None
         if light == "laser" and multiple == 1:
             stripe, place = get_stripe(image, self._sensor, background=unlit), LitPlace(position_mm, exposure_ms)
             self._slip.add(Place(position, exposure_ms, select_centres(stripe)))
-            self._watch.check(image, stripe, bright.level, place, unlit=unlit, last=last)
+            self._check_laser(image, stripe, bright.level, place, unlit=unlit, last=last)
             self._count(stripe, bright)
         seen.repeated = rig.repeated
         if zero_dn and isinstance(image, np.ndarray):
@@ -313,18 +310,67 @@ class _Taking:
             image = lit if unlit is None else subtract_background(image, unlit, clipped, zero_dn=zero_dn)
         return Frame(image, position, light == "laser", exposure_ms, 0.0, encoder=frame.encoder)
 
+    def _shows_laser(self, lit: Seen, unlit: Seen) -> bool:
+        return shows_laser(lit, unlit, self._sensor, difference=self._plan.background)
+
+    def _check_laser(
+        self, image: Seen, stripe: Stripe, level: float, here: LitPlace, *, unlit: np.ndarray | None, last: bool
+    ) -> None:
+        """Check that the laser emitted light in an image or centre line, before it is stored. The stage may move.
+
+        ``level`` is the brightness of the stripe, which is compared with that of the image before. ``unlit`` (H, W) is
+        an image without laser at the same position; if missing, it is taken when it is needed. No further image follows
+        the ``last``. Raises HardwareError if the laser emits no light.
+        """
+        now = (int((stripe.status != StripeStatus.NO_STRIPE).sum()), level)
+        if self._usual is None or any(a < _DROP * b for a, b in zip(now, self._usual, strict=True)):
+            dark = self._rig.frame("lamp", here.exposure_ms).seen if unlit is None else unlit
+            if not self._shows_laser(image, dark):
+                self._without += 1
+                if last or self._without % _AGAIN == 1:
+                    self._look_elsewhere(here)
+                return
+        self._usual, self._lit, self._without = now, here, 0
+
+    def _look_elsewhere(self, here: LitPlace) -> None:
+        """Look for the stripe where it was seen, or over the whole plan; raises HardwareError if it is nowhere."""
+        others = [position for position in select_evenly(self._positions_mm, LOOKS) if position != here.position_mm]
+        for place in [self._lit] if self._lit else [LitPlace(position, here.exposure_ms) for position in others]:
+            self._rig.move_to(place.position_mm)
+            lit, unlit = (self._rig.frame(light, place.exposure_ms).seen for light in ("laser", "lamp"))
+            if self._shows_laser(lit, unlit):
+                self._lit = place
+                self._rig.move_to(here.position_mm)
+                return
+        if self._lit is None:
+            raise self._no_light(here.exposure_ms)
+        passed = self._without - 1
+        also = f"; the {passed} images before this one have no stripe either" if passed else ""
+        raise HardwareError(
+            f"the laser has failed: at {self._lit.position_mm:g} mm, where its stripe was seen before, images with the "
+            f"laser on and off show the same{also}. Check its supply, key and interlock, then continue with `resume`"
+        )
+
+    def _no_light(self, exposure_ms: float) -> HardwareError:
+        """Return the error for a scan that sees no stripe anywhere."""
+        looked = select_evenly(self._positions_mm, LOOKS)
+        return HardwareError(
+            f"no laser light at any of {len(looked)} positions from {looked[0]:g} to {looked[-1]:g} mm, exposed by "
+            f"{exposure_ms:.3g} ms: images with the laser on and off show the same. Is the laser on (supply, key, "
+            "interlock), the object in the volume, the lens cap off?"
+        )
+
     def check_steps(self) -> None:
         """Revisit an early place with relief, if any; raises HardwareError if the stage is displaced."""
-        if (relief := self._slip.relief) is None:
+        if (place := self._slip.place) is None:
             return
-        place = relief.place
         self._rig.move_to(place.position_mm)
         image = self._rig.frame("laser", place.exposure_ms).seen
-        unlit = self._rig.image("lamp", place.exposure_ms)[0] if self._plan.background else None
-        slip_mm, error_mm = relief.measure_slip(select_centres(get_stripe(image, self._sensor, background=unlit)))
+        unlit = self._rig.frame("lamp", place.exposure_ms).image if self._plan.background else None
+        slip_mm, error_mm = self._slip.measure_slip(select_centres(get_stripe(image, self._sensor, background=unlit)))
         if not np.isfinite(slip_mm):
             seen = "shows no stripe at its earlier place; or the laser has failed since the last image"
-        elif relief.is_significant(slip_mm, error_mm):
+        elif self._slip.is_significant(slip_mm, error_mm):
             seen = f"shows a displacement of the stage of {slip_mm:+.2f} mm (std {error_mm:.2f} mm)"
         else:
             return

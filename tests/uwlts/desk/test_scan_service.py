@@ -20,8 +20,8 @@ from uwlts.calibration.sequential.sequential_calibration import CalibrationOptio
 from uwlts.desk import scan
 from uwlts.desk.scan import ScanService
 from uwlts.errors import CalibrationError, HardwareError
+from uwlts.hardware.camera_interface import ReplayCamera
 from uwlts.hardware.grbl import GrblStage
-from uwlts.hardware.replay import ReplayCamera
 from uwlts.hardware.scan_plan import ScanPlan, load_plan
 from uwlts.model.calibration import Calibration
 from uwlts.model.sensor import Sensor
@@ -68,6 +68,14 @@ def capture(thesis: Sensor, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def lit(thesis: Sensor, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Images that are replayed as those of the camera."""
     return write_images(tmp_path_factory.mktemp("captures") / "lit.h5", thesis, (True, True))
+
+
+class LoopedReplay(ReplayCamera):
+    """Replay that begins again after its last image."""
+
+    def _trigger(self) -> None:
+        self._shown %= 2
+        super()._trigger()
 
 
 def test_a_played_capture_gives_its_cloud_image_by_image_at_its_speed(capture: Path, calibration: Calibration):
@@ -129,7 +137,7 @@ def test_recorded_scans_are_files_and_clouds(tmp_path, lit, calibration, control
         clouds.append(cloud)
         assert (cloud.time_s == time_s).all()
 
-    with GrblStage(controller.port) as stage, ReplayCamera(lit, repeat=True) as camera:
+    with GrblStage(controller.port) as stage, LoopedReplay(lit) as camera:
         service = ScanService(
             plan, calibration, publish, folder=tmp_path, camera=camera, stage=stage, home=True, report=said.append
         )
@@ -148,7 +156,7 @@ def test_the_laser_off_service_ends_a_scan_with_the_laser_off(tmp_path, lit, cal
     said: list[str] = []
     begun = threading.Event()
     plan = plan_for(tmp_path, controller, lit, count=90)
-    with GrblStage(controller.port) as stage, ReplayCamera(lit, repeat=True) as camera:
+    with GrblStage(controller.port) as stage, LoopedReplay(lit) as camera:
         stage.home()
         service = ScanService(
             plan, calibration, lambda *_: begun.set(), folder=tmp_path, camera=camera, stage=stage, report=said.append

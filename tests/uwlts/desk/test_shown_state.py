@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from uwlts.desk.shown_state import KEPT_LINES, Board, Picture, encode_png
+from uwlts.desk.shown_state import KEPT_LINES, Board, Picture
 
 FULL = 255
 
@@ -176,9 +176,3 @@ def test_the_number_of_shown_pictures_is_counted():
     board.show(picture)
     board.show(picture)
     assert board.picture is picture and board.pictures == 2
-
-
-def test_a_png_keeps_its_colours():
-    colours = np.random.default_rng(0).integers(0, 256, (5, 7, 3), dtype=np.uint8)
-    again = cv2.imdecode(np.frombuffer(encode_png(colours), np.uint8), cv2.IMREAD_COLOR)
-    np.testing.assert_array_equal(again[..., ::-1], colours)

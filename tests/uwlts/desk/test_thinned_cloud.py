@@ -33,28 +33,12 @@ def test_every_nth_of_all_points_is_kept_in_order(at_most: int, sizes: list[int]
     cloud, total = filled(at_most, sizes), sum(sizes)
     kept = cloud.points()
     assert cloud.total == total and cloud.version == len(sizes) and len(kept) <= at_most
-    # The smallest power of two that keeps at most the wanted number, or the next one if it keeps exactly that many.
+    # The smallest power of two that keeps at most the wanted number, whatever the pieces.
     stride = 1
     while -(-total // stride) > at_most:
         stride *= 2
-    strides = [s for s in (stride, 2 * stride) if len(range(0, total, s)) == len(kept)]
-    assert strides or total == 0
-    expected = np.arange(0, total, strides[0] if strides else 1, dtype=float)
-    np.testing.assert_array_equal(kept[:, 0], expected)
+    expected = np.arange(0, total, stride, dtype=float)
     np.testing.assert_array_equal(kept[:, :3], np.column_stack([expected, expected + 0.25, -expected]))
-    # At least half of the capacity is used.
-    assert len(kept) >= min(total, at_most // 2)
-
-
-@given(at_most=st.integers(1, 50), sizes=PIECES)
-def test_the_selection_does_not_depend_on_the_pieces(at_most: int, sizes: list[int]):
-    whole = filled(at_most, [2 * (sum(sizes) // 2)])
-    halves = filled(at_most, [2 * (size // 2) for size in sizes])
-    if whole.total == halves.total:
-        np.testing.assert_array_equal(whole.points(), halves.points())
-    np.testing.assert_array_equal(
-        filled(at_most, [sum(sizes)]).points()[:, :4], filled(at_most, [1] * sum(sizes)).points()[:, :4]
-    )
 
 
 @given(at_most=st.integers(1, 50), sizes=PIECES)
@@ -107,8 +91,7 @@ def test_clearing_restarts():
     cloud.clear()
     assert (cloud.total, len(cloud.points()), cloud.version) == (0, 0, 2)
     cloud.add(points(0, 10))
-    # Every point again, apart from the halving when it is full.
-    assert cloud.points()[:, 0].tolist() in (list(range(10)), list(range(0, 10, 2)))
+    assert cloud.points()[:, 0].tolist() == list(range(10))
 
 
 def test_earlier_results_are_not_changed():

@@ -19,7 +19,7 @@ from packaging.requirements import Requirement
 
 from tests.system.in_process import uwlts
 from twin.devices.grbl_controller import BENCH_SETTINGS, GrblController
-from uwlts.doctor import devices, libraries
+from uwlts.doctor import machine
 from uwlts.doctor.machine import Finding, examine_renderer
 from uwlts.errors import SetupError
 from uwlts.runtime import optional_library
@@ -43,7 +43,7 @@ def as_nobody(program: str) -> str:
     """Output of a program that gives up administrator rights after its imports."""
     start = f"""
         import os
-        from uwlts.doctor.devices import examine_ports
+        from uwlts.doctor.machine import examine_ports
         if os.geteuid() == 0:
             os.setgroups([])
             os.setresgid({NOBODY}, {NOBODY}, {NOBODY})
@@ -104,13 +104,13 @@ def test_devices_that_are_named_and_missing_end_in_exit_code_1(tmp_path, monkeyp
 
 
 def test_python_is_compared_with_what_is_required():
-    assert libraries.examine_python(">=3.11").status == "ok"
-    too_old = libraries.examine_python(">=99")
+    assert machine.examine_python(">=3.11").status == "ok"
+    too_old = machine.examine_python(">=99")
     assert too_old.status == "missing" and "needed is >=99" in too_old.found and "install Python" in too_old.advice
 
 
 def test_the_requirements_are_the_projects_own():
-    python, required, extras = libraries.read_requirements()
+    python, required, extras = optional_library.read_requirements()
     assert python == ">=3.11"
     assert {"numpy", "rich", "optuna"} <= {Requirement(line).name for line in required}
     assert "dask" in {Requirement(line).name for lines in extras.values() for line in lines}
@@ -132,7 +132,7 @@ def test_an_installed_package_lists_its_requirements_without_a_checkout(tmp_path
         "Requires-Dist: winonly; sys_platform == 'win32'\nRequires-Dist: laspy>=2; extra == 'clouds'\n"
         "Requires-Dist: anything; extra == 'test'\n"
     )
-    program = "from uwlts.doctor import libraries; print(libraries.read_requirements())"
+    program = "from uwlts.doctor import machine; print(machine.read_requirements())"
     ended = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert ended.stdout.strip() == str(
         (">=3.11", ["numpy>=2"], {extra: [] for extra in EXTRAS} | {"clouds": ["laspy>=2"]})
@@ -140,7 +140,7 @@ def test_an_installed_package_lists_its_requirements_without_a_checkout(tmp_path
 
 
 def test_every_kind_of_missing_library_is_named():
-    found = libraries.examine_required(["numpy>=2", "pydantic>=999", "no-such-library-of-ours>=1"])
+    found = machine.examine_required(["numpy>=2", "pydantic>=999", "no-such-library-of-ours>=1"])
     version = metadata.version("pydantic")
     assert [each.status for each in found] == ["ok", "missing", "missing"]
     assert found[0].found == f"numpy {metadata.version('numpy')}"
@@ -152,7 +152,7 @@ def test_every_kind_of_missing_library_is_named():
 def test_absent_optional_libraries_are_optional_and_old_ones_a_warning():
     extras = {"xyz": ["no-such-library-of-ours>=2", "pytest>=8"], "there": ["pytest"], "old": ["pytest>=999"]}
     purposes = {"xyz": "clouds as XYZ", "there": "tests", "old": "tests"}
-    absent, there, old = libraries.examine_optional(extras, purposes)
+    absent, there, old = machine.examine_optional(extras, purposes)
     version = metadata.version("pytest")
     assert absent.status == "optional"
     assert absent.found == f"no-such-library-of-ours not installed, pytest {version}; for clouds as XYZ"
@@ -193,7 +193,7 @@ def test_an_invalid_libllvm_gives_a_warning_with_the_install_command(tmp_path, m
 
 def test_an_aravis_that_does_not_load_is_a_warning_that_says_how_to_get_it(tmp_path):
     (tmp_path / "libaravis.so").write_text("not a library")
-    program = "from uwlts.doctor.devices import examine_cameras; print(*examine_cameras(), sep='\\n')"
+    program = "from uwlts.doctor.machine import examine_cameras; print(*examine_cameras(), sep='\\n')"
     ended = subprocess.run(
         [sys.executable, "-c", program],
         cwd=ROOT,
@@ -223,8 +223,8 @@ def test_a_port_that_this_user_may_not_open_is_a_warning_with_the_command():
 
 
 def test_a_port_that_is_gone_is_a_warning():
-    assert devices.examine_ports(["/dev/ttyNone"])[0].found == "/dev/ttyNone is not there"
-    assert devices.examine_ports([])[0].found == "none"
+    assert machine.examine_ports(["/dev/ttyNone"])[0].found == "/dev/ttyNone is not there"
+    assert machine.examine_ports([])[0].found == "none"
 
 
 # A camera
@@ -238,20 +238,20 @@ def images(folder: Path, grey: int, count: int = 12) -> str:
 
 
 def test_ten_frames_are_taken_and_judged(tmp_path):
-    (good,) = devices.try_camera(images(tmp_path / "good", 51))
+    (good,) = machine.try_camera(images(tmp_path / "good", 51))
     assert good.status == "ok" and "64 x 48 px of 8 bit" in good.found
     # 51 of 255.
     assert "10 frames" in good.found and good.found.endswith("mean grey value 20.0 % of full scale")
-    (white,) = devices.try_camera(images(tmp_path / "white", 255))
+    (white,) = machine.try_camera(images(tmp_path / "white", 255))
     assert white.status == "warning" and "saturated" in white.advice
-    (black,) = devices.try_camera(images(tmp_path / "black", 0))
+    (black,) = machine.try_camera(images(tmp_path / "black", 0))
     assert black.status == "warning" and "lens cap" in black.advice
 
 
 def test_a_camera_that_does_not_give_ten_frames_is_missing(tmp_path):
-    (short,) = devices.try_camera(images(tmp_path / "few", 51, count=9))
+    (short,) = machine.try_camera(images(tmp_path / "few", 51, count=9))
     assert short.status == "missing" and "all 9 images" in short.found
-    (unknown,) = devices.try_camera("webcam:0")
+    (unknown,) = machine.try_camera("webcam:0")
     assert unknown.status == "missing" and "is not a camera address" in unknown.found
     assert "gige:NAME" in unknown.advice
 
@@ -273,14 +273,14 @@ def test_the_settings_are_those_of_the_documentation():
     rows = [line for line in text.splitlines() if line.startswith("| `$")]
     documented = {int(number): float(value) for row in rows for number, value in re.findall(r"`\$(\d+)=(\d+)`", row)}
     assert len(documented) > 15
-    examined = {number: value for number, (value, _) in devices.BEHAVIOUR.items()} | devices.MECHANICS
+    examined = {number: value for number, (value, _) in machine.BEHAVIOUR.items()} | machine.MECHANICS
     assert examined == documented
-    assert devices.judge_settings(BENCH_SETTINGS)[0].status == "ok"
+    assert machine.judge_settings(BENCH_SETTINGS)[0].status == "ok"
 
 
 def test_a_stage_as_documented_is_in_order():
     with unmoved() as controller:
-        build, settings, state, laser = devices.try_stage(controller.port)
+        build, settings, state, laser = machine.try_stage(controller.port)
     assert build.found == f"{controller.port}: Grbl 1.1h, options V"
     assert [each.status for each in (build, settings, state, laser)] == ["ok"] * 4
     assert "NOT if program and guard are killed" in laser.found
@@ -289,7 +289,7 @@ def test_a_stage_as_documented_is_in_order():
 
 def test_settings_that_contradict_the_documentation_are_named():
     with unmoved(settings={1: 25, 32: 0, 100: 250}) as controller:
-        _, behaviour, mechanics, *_ = devices.try_stage(controller.port)
+        _, behaviour, mechanics, *_ = machine.try_stage(controller.port)
     assert behaviour.status == mechanics.status == "warning"
     assert behaviour.found.startswith("$1 is 25, not 255") and "$32 is 0, not 1" in behaviour.found
     assert behaviour.advice.endswith(": $1=255 $32=1")
@@ -298,22 +298,22 @@ def test_settings_that_contradict_the_documentation_are_named():
 
 def test_a_stage_without_a_switch_is_explained():
     with unmoved(settings={20: 0, 22: 0}) as controller:
-        _, settings, state, _ = devices.try_stage(controller.port)
+        _, settings, state, _ = machine.try_stage(controller.port)
     assert "without a limit switch" in settings.advice
     assert (state.status, state.found) == ("ok", "idle")
 
 
 def test_an_alarm_silence_and_a_firmware_that_cannot_switch_the_laser_are_missing():
     with unmoved(options="") as controller:
-        assert "without V" in devices.try_stage(controller.port)[0].found
+        assert "without V" in machine.try_stage(controller.port)[0].found
     with unmoved() as controller:
         controller.inject("mute")
-        (silent,) = devices.try_stage(controller.port)
+        (silent,) = machine.try_stage(controller.port)
     assert silent.status == "missing" and "nothing answers" in silent.found
     assert "docs/how-to/hardware-stage.md" in silent.advice
 
 
 def test_a_pressed_switch_is_a_warning():
     with GrblController(position_mm=-0.1, boot_s=0.1) as controller:
-        state = devices.try_stage(controller.port)[2]
+        state = machine.try_stage(controller.port)[2]
     assert state.status == "warning" and "X are active" in state.found and "limit switch is pressed" in state.advice

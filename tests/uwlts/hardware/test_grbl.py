@@ -48,7 +48,7 @@ def stage(controller: GrblController) -> Iterator[GrblStage]:
     with GrblStage(controller.port) as opened:
         opened.home()
         yield opened
-        opened._line.fault = opened._line.fault or "test over"
+        opened.fault = opened.fault or "test over"
 
 
 REAL = {"boot_s": 0.2, "position_mm": 30.0, "settings": {24: 2400, 25: 7200, 110: 7200, 120: 2000}}
@@ -68,7 +68,7 @@ def sweeping(real: GrblController) -> Iterator[GrblStage]:
     with GrblStage(real.port) as opened:
         opened.home()
         yield opened
-        opened._line.fault = opened._line.fault or "test over"
+        opened.fault = opened.fault or "test over"
 
 
 # Messages
@@ -88,7 +88,7 @@ def sweeping(real: GrblController) -> Iterator[GrblStage]:
         (">G54G20:ok", Reply("message", text=">G54G20:ok")),
         (
             "<Hold:0|MPos:-5.000,1.000,0.000|Bf:15,128|FS:0,1000|Pn:XZ|WCO:1.500,0.000,0.000>",
-            Status("Hold", 0, machine_mm=-5.0, offset_mm=1.5, spindle=1000.0, pins="XZ"),
+            Status("Hold", machine_mm=-5.0, offset_mm=1.5, spindle=1000.0, pins="XZ"),
         ),
         ("<Idle|WPos:2.000,0.000,0.000|F:0>", Status("Idle", work_mm=2.0)),
     ],
@@ -305,13 +305,13 @@ def test_blocks_hold_words_and_commands_apart():
 def test_opening_reads_version_settings_and_state(controller):
     with GrblStage(controller.port) as stage:
         assert stage.version == "1.1h"
-        assert (stage.settings.step_mm, stage.settings.travel_mm) == (STEP_MM, 750.0)
+        assert (1 / stage.settings.steps_per_mm, stage.settings.travel_mm) == (STEP_MM, 750.0)
         assert stage.limits_mm == (0.0, 750.0)
         assert not stage.position_known
         with pytest.raises(HardwareError, match="home it first"):
             stage.move_to(10.0, feed_mm_per_min=100.0)
         # With this flag DTR drops when any process closes the port.
-        assert termios.tcgetattr(stage._line._serial.fd)[2] & termios.HUPCL
+        assert termios.tcgetattr(stage._serial.fd)[2] & termios.HUPCL
 
 
 def test_resets_of_the_program_before_are_no_fault(controller, monkeypatch):
@@ -391,7 +391,7 @@ def test_positions_count_from_the_lower_end_whatever_grbl_calls_them(settings, o
         assert stage.home() == pytest.approx(home_mm, abs=1e-9)
         # Homing sets the zero after the pull-off, so the controller's zero is beside the switch.
         offset_mm = {"VZ": 2.0 if settings.get(23) else -2.0}.get(options, 0.0)
-        stage._line.command("G92X5")
+        stage.command("G92X5")
         for target_mm in (410.0, 400.0125):
             assert stage.move_to(target_mm, feed_mm_per_min=900.0) == pytest.approx(target_mm, abs=1e-9)
             assert controller.state().position_mm == pytest.approx(target_mm + offset_mm, abs=1e-9)
@@ -482,7 +482,7 @@ def test_the_laser_is_lit_on_the_way_alone(real, sweeping):
     # Back, over a distance shorter than the part that is sent at once.
     assert sweeping.sweep(150.0, feed_mm_per_min=SWEEP) == 150.0
     with pytest.raises(RangeError, match="too fast for a moving stage with the laser on: at most"):
-        sweeping._line.command("$120=100")
+        sweeping.command("$120=100")
         sweeping.settings = replace(sweeping.settings, acceleration_mm_per_s2=100.0)
         sweeping.sweep(200.0, feed_mm_per_min=SWEEP)
 
@@ -495,6 +495,8 @@ def test_what_is_raised_on_the_way_brakes_the_stage_in_the_dark(real, sweeping):
     with pytest.raises(OSError, match="disk full"):
         sweeping.sweep(700.0, feed_mm_per_min=SWEEP, reported=report)
     assert wait_for(lambda: not real.state().laser_on and not real.state().moving, 0.3)
+    with pytest.raises(HardwareError, match="held"):
+        sweeping.move_to(20.0, feed_mm_per_min=SWEEP)
     assert sweeping.unlock() == pytest.approx(real.state().position_mm, abs=STEP_MM)
 
 
@@ -519,32 +521,6 @@ def test_a_laser_that_gives_no_light_is_seen_by_the_twin_alone(controller, stage
     controller.inject("break-laser")
     stage.laser(True)
     assert not controller.state().laser_on and stage.laser_power == 1.0
-
-
-# Stopping
-
-
-def interrupt_after(seconds: float) -> threading.Timer:
-    timer = threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGINT))
-    timer.start()
-    return timer
-
-
-@pytest.mark.parametrize("reset", [True, False])
-def test_an_interrupted_movement_can_be_stopped_without_losing_the_position(controller, stage, reset):
-    interrupt_after(0.3)
-    with pytest.raises(KeyboardInterrupt):
-        stage.move_to(700.0, feed_mm_per_min=200.0)  # 2 s
-    stopped_mm = stage.stop(reset=reset)
-    assert 10.0 < stopped_mm < 690.0
-    assert not controller.state().laser_on and not controller.state().moving
-    if not reset:
-        with pytest.raises(HardwareError, match="held"):
-            stage.move_to(20.0, feed_mm_per_min=900.0)
-        assert stage.unlock() == stopped_mm
-    assert stage.move_to(stopped_mm + 1, feed_mm_per_min=900.0) == pytest.approx(stopped_mm + 1, abs=1e-9)
-    # Within a step, as the stop is between steps.
-    assert controller.state().position_mm == pytest.approx(stopped_mm + 1, abs=STEP_MM)
 
 
 # Faults
@@ -589,8 +565,8 @@ def test_a_fault_while_moving_is_named_and_the_laser_is_off(real, sweeping, faul
 def test_a_fault_at_the_moment_of_a_reset_is_named(controller, stage, monkeypatch, fault, message):
     """A light ends by a reset; the greeting after a restart just before it looks like the answer."""
     stage.laser(True, at_most_s=5.0)
-    end = stage._line.end
-    monkeypatch.setattr(stage._line, "end", lambda: (controller.inject(fault), end()))
+    end = stage.end
+    monkeypatch.setattr(stage, "end", lambda: (controller.inject(fault), end()))
     with pytest.raises(HardwareError, match=message):
         stage.laser(False)
     assert not controller.state().laser_on
@@ -776,7 +752,7 @@ LIT = """
     with GrblStage(sys.argv[1]) as stage:
         stage.home()
         stage.laser(True)
-        print(stage._line._guard.pid, flush=True)
+        print(stage._guard.pid, flush=True)
         {then}
 """
 MOVES = """stage.laser(False)
@@ -832,7 +808,7 @@ def test_without_the_guard_the_interlock_and_else_the_controller_end_the_light(g
 
 
 def test_the_laser_is_not_lit_without_its_guard(controller, stage):
-    os.kill(stage._line._guard.pid, signal.SIGKILL)
+    os.kill(stage._guard.pid, signal.SIGKILL)
     with pytest.raises(HardwareError, match="switches the laser off after a crash, is gone"):
         stage.laser(True)
     assert not controller.state().laser_on
@@ -868,19 +844,19 @@ def test_the_controller_ends_a_laser_with_a_time_by_itself(controller, stage):
     assert stage.position_known and stage.move_to(60.0, feed_mm_per_min=900.0) == 60.0
     # Light that ends early is an error: images exposed meanwhile may be dark.
     stage.laser(True, at_most_s=5.0)
-    os.write(stage._line._serial.fileno(), b"\x18")
+    os.write(stage._serial.fileno(), b"\x18")
     with pytest.raises(HardwareError, match="does not follow|restarted"):
         stage.laser(False)
 
 
 def test_a_computer_that_asks_after_a_timed_light_takes_the_darkness_for_no_fault(controller, stage, monkeypatch):
-    begin = stage._line.begin
+    begin = stage.begin
 
     def begin_and_be_late(*lines):
         begin(*lines)
         time.sleep(0.3)
 
-    monkeypatch.setattr(stage._line, "begin", begin_and_be_late)
+    monkeypatch.setattr(stage, "begin", begin_and_be_late)
     stage.laser(True, at_most_s=0.05)
     assert not controller.state().laser_on
     stage.laser(False)

@@ -24,22 +24,22 @@ def watched(slope: np.ndarray, rng: np.random.Generator, count: int = 6) -> Slip
 def test_the_slip_is_found_to_its_standard_error(slip_mm):
     rng = np.random.default_rng(1)
     slope = np.linspace(-3, 3, LINES)
-    relief = watched(slope, rng).relief
-    assert relief.place.position_mm == 2.0
-    found = [relief.measure_slip(centres(2.0 + slip_mm, slope, rng)) for _ in range(30)]
+    watch = watched(slope, rng)
+    assert watch.place.position_mm == 2.0
+    found = [watch.measure_slip(centres(2.0 + slip_mm, slope, rng)) for _ in range(30)]
     slips, errors = np.array(found).T
     # Noise of two centres divided by a root mean square motion of 1.7 px/mm on 400 lines is 0.004 mm; twice that is
     # reported, for lines that share speckle. All draws share the place's own noise.
     assert 0.006 < errors.mean() < 0.012
     assert abs(slips.mean() - slip_mm) < 0.02 and slips.std() < errors.mean()
-    assert all(relief.is_significant(*each) == (abs(slip_mm) > 0.05) for each in found)
+    assert all(watch.is_significant(*each) == (abs(slip_mm) > 0.05) for each in found)
 
 
 def test_where_the_picture_stays_the_same_nothing_is_reported():
     rng = np.random.default_rng(2)
-    assert watched(np.zeros(LINES), rng).relief is None
-    assert watched(np.full(LINES, 0.1), rng).relief is None
-    assert watched(np.linspace(-3, 3, LINES), rng, count=2).relief is None
+    assert watched(np.zeros(LINES), rng).place is None
+    assert watched(np.full(LINES, 0.1), rng).place is None
+    assert watched(np.linspace(-3, 3, LINES), rng, count=2).place is None
 
 
 def test_the_earliest_place_with_relief_counts():
@@ -47,14 +47,14 @@ def test_the_earliest_place_with_relief_counts():
     for k in range(10):
         empty = np.full(LINES, np.nan)
         watch.add(Place(float(k), 1.0, empty if k < 4 else centres(float(k), np.full(LINES, 2.0), rng)))
-    assert watch.relief.place.position_mm == 5.0
+    assert watch.place.position_mm == 5.0
 
 
 def test_an_object_that_is_gone_is_no_slip():
     rng = np.random.default_rng(4)
-    relief = watched(np.full(LINES, 2.0), rng).relief
-    assert not relief.is_significant(*relief.measure_slip(np.full(LINES, np.nan)))
+    watch = watched(np.full(LINES, 2.0), rng)
+    assert not watch.is_significant(*watch.measure_slip(np.full(LINES, np.nan)))
     # A third of the lines now shows another surface.
     again = centres(2.0, np.full(LINES, 2.0), rng)
     again[: LINES // 3] += 40
-    assert not relief.is_significant(*relief.measure_slip(again))
+    assert not watch.is_significant(*watch.measure_slip(again))

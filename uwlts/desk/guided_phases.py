@@ -6,7 +6,6 @@ The target is shown at the stage's positions or held by hand.
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +25,6 @@ from uwlts.calibration.camera.image_quality import (
     measure_shift_px,
 )
 from uwlts.calibration.guidance.pose_advice import (
-    CompletionLimits,
     PoseAdvice,
     RecordedPose,
     Setting,
@@ -47,9 +45,10 @@ from uwlts.calibration.guidance.step import (
     least_separation_mm,
     next_depth_mm,
 )
+from uwlts.desk.guided_plan import GuidedPlan, GuidedStep
+from uwlts.desk.guided_screen import BoardScreen
+from uwlts.desk.shown_state import Picture
 from uwlts.errors import CalibrationError, TargetError
-from uwlts.hardware.guided.guided_plan import GuidedPlan, GuidedStep
-from uwlts.hardware.guided.operator import Operator, Screen
 from uwlts.hardware.rig import START_MS, Rig
 from uwlts.hardware.scan_plan import Light, RigPlan
 from uwlts.model.calibration import Calibration, WindowModel
@@ -66,8 +65,7 @@ _NUMBER_MM = 1e-3
 # A pose that was not requested is taken if its gain is at least this fraction of the best pose's gain.
 _USEFUL = 0.25
 _RESETTLE_S = 2.0
-# The stage's steps may be small: its position distinguishes the poses.
-_STAGE_CHANGE_PX = 0.5
+_STAGE_CHANGE_PX = 0.5  # least difference of poses at positions of the stage
 
 
 class Session:
@@ -82,14 +80,13 @@ class Session:
         rig: Rig,
         plan: RigPlan,
         writer: CaptureWriter,
-        operator: Operator,
-        screen: Screen,
+        screen: BoardScreen,
         *,
         dtype: np.dtype,
         known_ms: dict[Light, float],
         before_s: float,
     ):
-        self.rig, self.operator, self.screen = rig, operator, screen
+        self.rig, self.screen = rig, screen
         self._plan, self._writer, self._dtype = plan, writer, dtype
         self._exposure_ms = plan.planned_ms() | known_ms
         self._start_s = time.monotonic() - before_s
@@ -98,12 +95,13 @@ class Session:
         """Take an image (H, W) in a light; return it with its exposure in ms."""
         if light not in self._exposure_ms:
             self.settle(light)
-        image, exposure_ms = self.rig.image(light, self._exposure_ms.get(light, START_MS))
-        return image.astype(self._dtype, copy=False), exposure_ms
+        asked_ms = self._exposure_ms.get(light, START_MS)
+        frame = self.rig.frame(light, asked_ms)
+        return frame.image.astype(self._dtype, copy=False), asked_ms if frame.exposure_ms is None else frame.exposure_ms
 
     def take_unlit(self) -> np.ndarray:
         """Take a short image (H, W) without laser, in the ambient light."""
-        return self.rig.image("lamp", START_MS)[0]
+        return self.rig.frame("lamp", START_MS).image
 
     def settle(self, light: Light) -> bool:
         """Find the exposure for the present scene; return False if it is planned, or the scene is too dark."""
@@ -119,12 +117,7 @@ class Session:
     ) -> None:
         """Show an image (H, W) with points (N, 2) and stripe pixels (N, 2) on the screen."""
         full = self._writer.header.saturation_dn
-        self.screen.live(image, full_dn=full, points=points, stripe=stripe, remark=remark)
-
-    def report(self, line: str) -> None:
-        """Output a line, and add it to the screen's list of images."""
-        self.operator.say(line)
-        self.screen.add(line)
+        self.screen.show(Picture(image, full_dn=full, caption=remark, stripe=stripe, points=points))
 
     def record(self, image: np.ndarray, exposure_ms: float, *, stage_mm: float, laser_on: bool) -> None:
         """Write an image (H, W) to the capture."""
@@ -133,12 +126,21 @@ class Session:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Target found in a lamp image (H, W), or None, with the reasons that make it unusable."""
+    """Target found in a lamp image (H, W), or None, with the reasons that make it unusable.
+
+    An accepted one has the ``pose`` to be recorded, and the calibration ``state`` that includes it. ``lamp_ms`` is the
+    exposure of the image. ``laser`` is the image (H, W) with the laser line and its exposure in ms, if the line was on
+    the target.
+    """
 
     image: np.ndarray
     view: TargetView | None
     quality: TargetQuality | None
     reasons: tuple[str, ...]
+    pose: RecordedPose | None = None
+    state: State | None = None
+    lamp_ms: float = 0.0
+    laser: tuple[np.ndarray, float] | None = None
 
     @property
     def usable(self) -> TargetView | None:
@@ -146,26 +148,9 @@ class Found:
         return None if self.reasons else self.view
 
     def line(self) -> str:
-        """Return the reasons as a line of text."""
-        return f"refused: {'; '.join(self.reasons)}"
-
-
-@dataclass(frozen=True, eq=False)
-class Accepted(Found):
-    """A pose to be recorded, and the calibration ``state`` that includes it.
-
-    ``lamp_ms`` is the exposure of the image. ``laser`` is the image (H, W) with the laser line and its exposure in ms,
-    if the line was on the target.
-    """
-
-    quality: TargetQuality
-    pose: RecordedPose
-    lamp_ms: float
-    laser: tuple[np.ndarray, float] | None
-    state: State
-
-    def line(self) -> str:
-        """Return the quality as a line of text."""
+        """Return the quality of an accepted pose, or the reasons against it, as a line of text."""
+        if self.quality is None or self.pose is None or self.state is None:
+            return f"refused: {'; '.join(self.reasons)}"
         quality, state = self.quality, self.state
         stripe = f"stripe on {len(self.pose.stripe)} lines" if self.laser else "no stripe on the target"
         residual = "not yet" if state.solution is None else f"{state.solution.image_rms_px()[-1]:.2f} px"
@@ -175,14 +160,20 @@ class Accepted(Found):
         )
 
 
-class PoseJudge:
-    """Judgement of target images, new or recorded; ``full_dn`` is the saturation grey value."""
+def list_missing(state: State) -> list[str]:
+    """List the evidence that is still missing for camera and laser sheet."""
+    return [*describe_missing(state), *describe_missing_sheet(state)]
 
-    def __init__(self, setting: Setting, wanted: CompletionLimits, *, full_dn: int):
-        self._setting, self._wanted, self._full = setting, wanted, full_dn
-        self.judge_novelty = (
-            judge_novelty if setting.poses == "free" else partial(judge_novelty, least_px=_STAGE_CHANGE_PX)
-        )
+
+class TargetPhase:
+    """Recording of target poses until the goal is reached, and judgement of their images, new or recorded."""
+
+    _session: Session
+
+    def __init__(self, plan: GuidedPlan, setting: Setting):
+        self._plan, self._setting, self._wanted = plan, setting, plan.goal()
+        self._full = setting.sensor.detector.full_scale_dn()
+        self._settled_s = -np.inf
 
     def find(self, image: np.ndarray) -> Found:
         """Find and judge the target in a lamp image (H, W)."""
@@ -216,14 +207,14 @@ class PoseJudge:
                     poses.append(RecordedPose(view, stripe, stage_mm))
         return poses
 
-    def attempt(self, session: Session, before: State, stage_mm: float) -> Found:
-        """Try to take the target as the next pose after those of ``before``; return `Accepted`, or the reasons."""
+    def _attempt(self, before: State, stage_mm: float) -> Found:
+        """Try to take the target as the next pose after those of ``before``; return it accepted, or with reasons."""
+        session = self._session
         lamp, lamp_ms = session.take("lamp")
         found = self.find(lamp)
-        view, quality = found.usable, found.quality
-        if view is None or quality is None:
+        if (view := found.usable) is None:
             return found
-        if reasons := self.judge_novelty(view, [p.view for p in before.recorded]):
+        if reasons := self._judge_novelty(view, [p.view for p in before.recorded]):
             return replace(found, reasons=reasons)
         laser = session.take("laser")
         stripe = self.stripe(laser[0], view)
@@ -246,42 +237,34 @@ class PoseJudge:
             reasons = (f"contradicts the others: with it {state.undetermined}",)
         if reasons:
             return replace(found, reasons=reasons)
-        return Accepted(lamp, view, quality, (), pose, lamp_ms, laser if shown else None, state)
+        return replace(found, pose=pose, state=state, lamp_ms=lamp_ms, laser=laser if shown else None)
 
+    def _judge_novelty(self, view: TargetView, recorded: list[TargetView]) -> tuple[str, ...]:
+        # The stage's steps may be small: its position distinguishes the poses.
+        by_stage = {} if self._plan.poses == "free" else {"least_px": _STAGE_CHANGE_PX}
+        return judge_novelty(view, recorded, **by_stage)
 
-def list_missing(state: State) -> list[str]:
-    """List the evidence that is still missing for camera and laser sheet."""
-    return [*describe_missing(state), *describe_missing_sheet(state)]
-
-
-class TargetPhase:
-    """Recording of target poses until the goal is reached."""
-
-    def __init__(self, plan: GuidedPlan, session: Session, judge: PoseJudge):
-        self._plan, self._session, self._judge = plan, session, judge
-        self._operator, self._screen = session.operator, session.screen
-        self._settled_s = -np.inf
-
-    def run(self, state: State) -> State:
+    def run(self, session: Session, state: State) -> State:
         """Continue from a state, and return the final state.
 
         Raises HardwareError if camera, stage or laser fail, and OutputError if the capture cannot be written.
         """
+        self._session = session
         self._show_state(state)
         return self._free(state) if self._plan.poses == "free" else self._by_stage(state)
 
     def _by_stage(self, state: State) -> State:
         places = self._plan.places_left(state.recorded)
         for number, place in enumerate(places):
-            self._screen.request(f"the stage goes to {place:.2f} mm, {len(places) - number} positions left")
-            answer = self._operator.answer()
+            self._session.screen.request(f"the stage goes to {place:.2f} mm, {len(places) - number} positions left")
+            answer = self._session.screen.answer()
             if answer == "done":
                 break
             if answer == "skip":
                 continue
             position = self._session.rig.move_to(place)
             for _ in range(_TRIES):
-                found = self._judge.attempt(self._session, state, position)
+                found = self._attempt(state, position)
                 state = self._record_accepted(found, state, f"{position:.2f} mm")
                 # Another attempt may succeed once the target is at rest, or with another exposure.
                 moved = any(isinstance(reason, MotionFault) for reason in found.reasons)
@@ -295,9 +278,9 @@ class TargetPhase:
         still: TargetView | None = None
         since_s, skipped = time.monotonic(), 0
         while list_missing(state) and len(state.recorded) < self._plan.most_images:
-            found = self._judge.find(self._session.take("lamp")[0])
+            found = self.find(self._session.take("lamp")[0])
             advice = advice or best_pose(state, spin_rad=_estimate_spin(found.usable, state), skipped=skipped)
-            answer = self._operator.answer()
+            answer = self._session.screen.answer()
             if answer == "done":
                 break
             if answer == "skip":
@@ -312,10 +295,10 @@ class TargetPhase:
             if answer is None and (reasons or not stands):
                 continue
             last = max((round(pose.stage_mm / _NUMBER_MM) for pose in state.recorded), default=0)
-            found = self._judge.attempt(self._session, state, _NUMBER_MM * (last + 1))
+            found = self._attempt(state, _NUMBER_MM * (last + 1))
             state = self._record_accepted(found, state, f"image {len(state.recorded) + 1}")
             still, since_s = None, time.monotonic()
-            if isinstance(found, Accepted):
+            if found.pose is not None:
                 advice, skipped = None, 0
             else:
                 refused = [] if found.view is None else [found.view]
@@ -328,7 +311,7 @@ class TargetPhase:
         view = found.usable
         if view is None:
             return found.reasons
-        reasons = self._judge.judge_novelty(view, known)
+        reasons = self._judge_novelty(view, known)
         if reasons or advice is None or describe_missing_sheet(state):
             return reasons
         gain = compute_gain(state, view, estimate_pose(view, state.camera))
@@ -341,9 +324,9 @@ class TargetPhase:
         request = "move the target" if advice is None else format_pose_advice(advice.candidate.pose, state, pose)
         if sheet and not describe_missing(state):
             request = f"move the target so that the laser line lies on it, nearer and farther: {sheet[0]}"
-        self._screen.request(request if reasons else "hold it still")
+        self._session.screen.request(request if reasons else "hold it still")
         hint = request if advice is None or sheet else format_pose_advice(advice.candidate.pose, state, None)
-        self._operator.hint(f"next: {hint}")
+        self._session.screen.hint(f"next: {hint}")
         points = None if found.view is None else found.view.pixels
         self._session.show(found.image, "; ".join(reasons) or "good", points=points)
 
@@ -359,20 +342,20 @@ class TargetPhase:
     def _record_accepted(self, found: Found, state: State, name: str) -> State:
         """Record an accepted pose, report the result, and return the state after it."""
         stripe = None
-        if isinstance(found, Accepted):
+        if found.pose is not None and found.state is not None:
             state, stripe, stage_mm = found.state, found.pose.stripe, found.pose.stage_mm
             self._session.record(found.image, found.lamp_ms, stage_mm=stage_mm, laser_on=False)
             if found.laser is not None:
                 self._session.record(*found.laser, stage_mm=stage_mm, laser_on=True)
         line = f"{name}: {found.line()}"
-        self._session.report(line)
+        self._session.screen.report(line)
         points = None if found.view is None else found.view.pixels
         self._session.show(found.image, line, points=points, stripe=stripe)
         self._show_state(state)
         return state
 
     def _show_state(self, state: State) -> None:
-        self._screen.show_coverage(state.coverage, [pose.view.pixels for pose in state.recorded])
+        self._session.screen.show_coverage(state.coverage, [pose.view.pixels for pose in state.recorded])
 
 
 def _estimate_spin(view: TargetView | None, state: State) -> float:
@@ -382,21 +365,24 @@ def _estimate_spin(view: TargetView | None, state: State) -> float:
 
 
 @dataclass(frozen=True)
-class StepJudge:
-    """Judgement of laser images of the standard, with the calibration in air and the nominal window."""
+class StepPhase:
+    """Recording of the step standard near, in the middle and far.
+
+    Its laser images are judged with the ``calibration`` in air and the nominal ``window``.
+    """
 
     step: GuidedStep
     sensor: Sensor
     calibration: Calibration
     window: WindowModel
 
-    def judge(self, image: np.ndarray) -> StepQuality:
+    def _judge(self, image: np.ndarray) -> StepQuality:
         """Judge the step standard's stripe in an image (H, W)."""
         return judge_step(
             image,
             self.calibration,
             self.window,
-            self.step.standard(),
+            self.step,
             medium_index=self.sensor.medium(self.step.medium).refractive_index(self.sensor.laser.wavelength_nm),
             full_dn=self.sensor.detector.full_scale_dn(),
         )
@@ -404,25 +390,18 @@ class StepJudge:
     def depths_mm(self, path: Path) -> list[float]:
         """Return the standard's depths outside the window in a recording."""
         with Capture(path) as capture:
-            qualities = [self.judge(image) for _, image in capture.frames(laser_on=True)]
+            qualities = [self._judge(image) for _, image in capture.frames(laser_on=True)]
         return [each.depth_mm for each in qualities if each.depth_mm is not None and not each.reasons]
 
-
-class StepPhase:
-    """Recording of the standard near, in the middle and far."""
-
-    def __init__(self, judge: StepJudge, session: Session):
-        self._judge, self._session = judge, session
-
-    def run(self, seen_mm: Sequence[float]) -> list[float]:
+    def run(self, session: Session, seen_mm: Sequence[float]) -> list[float]:
         """Continue after the recorded depths; return all depths. Raises the errors of `TargetPhase.run`."""
-        seen, session, skipped = list(seen_mm), self._session, 0
-        while (wanted := next_depth_mm(seen, self._judge.sensor, skipped=skipped)) is not None:
+        seen, skipped = list(seen_mm), 0
+        while (wanted := next_depth_mm(seen, self.sensor, skipped=skipped)) is not None:
             request = (
                 f"put the step standard about {wanted:.0f} mm outside the window, with the laser line across its step"
             )
             session.screen.request(request)
-            answer = session.operator.wait(request, lambda: session.show(session.take_unlit(), "the laser is off"))
+            answer = session.screen.wait(request, lambda: session.show(session.take_unlit(), "the laser is off"))
             if answer == "done":
                 break
             if answer == "skip":
@@ -430,23 +409,22 @@ class StepPhase:
                 continue
             skipped = 0
             before = tuple(seen)
-            for position in self._judge.step.positions_mm or (None,):
-                taken = self._take(position, before)
+            for position in self.step.positions_mm or (None,):
+                taken = self._take(session, position, before)
                 seen += [] if taken is None else [taken]
         return seen
 
-    def _take(self, position: float | None, before_mm: Sequence[float]) -> float | None:
+    def _take(self, session: Session, position: float | None, before_mm: Sequence[float]) -> float | None:
         """Take the standard as it is; return the recorded depth in mm, or None if it was refused."""
-        session = self._session
         stage_mm = 0.0 if position is None else session.rig.move_to(position)
         image, exposure_ms = session.take("laser")
-        quality = self._judge.judge(image)
+        quality = self._judge(image)
         if any(isinstance(reason, LaserFault) for reason in quality.reasons) and session.settle("laser"):
             image, exposure_ms = session.take("laser")
-            quality = self._judge.judge(image)
+            quality = self._judge(image)
         # The laser must be off while the standard is moved.
         session.take_unlit()
-        depth_mm, reasons, sensor = quality.depth_mm, quality.reasons, self._judge.sensor
+        depth_mm, reasons, sensor = quality.depth_mm, quality.reasons, self.sensor
         if depth_mm is not None and not reasons and not is_separate_depth(depth_mm, before_mm, sensor):
             nearest = min(before_mm, key=lambda other: abs(other - depth_mm))
             reasons = (
@@ -457,7 +435,7 @@ class StepPhase:
             line = f"refused: {'; '.join(reasons)}"
         else:
             line = f"stripe on {len(quality.pixels)} lines, {depth_mm:.0f} mm outside the window"
-        session.report(f"step: {line}")
+        session.screen.report(f"step: {line}")
         session.show(image, line, stripe=quality.pixels)
         if reasons or depth_mm is None:
             return None

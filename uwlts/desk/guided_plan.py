@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -13,7 +13,7 @@ from uwlts.errors import DescriptionError
 from uwlts.hardware.scan_plan import Direction, RigPlan, StageSettings, Table, read_plan_table
 from uwlts.model.artefacts import StepStandard
 from uwlts.model.library import validate_description
-from uwlts.model.sensor import Description, NotNegative, Positive
+from uwlts.model.sensor import NotNegative
 from uwlts.storage.capture import CaptureHeader
 from uwlts.targets import parse_target
 
@@ -49,23 +49,15 @@ class GuidedStage(StageSettings):
         return np.linspace(self.first_mm, self.last_mm, self.count).tolist()
 
 
-class GuidedStep(Description):
+class GuidedStep(StepStandard):
     """The step standard in the medium of use, shown near, in the middle and far, each time at ``positions_mm``.
 
-    Without positions the stage does not move. ``height_mm`` and the following fields are those of `StepStandard`.
+    Without positions the stage does not move.
     """
 
     medium: str
-    height_mm: Positive
-    height_uncertainty_mm: NotNegative | None = None
-    reference: Literal["lower", "upper"] = "lower"
-    edge_mm: NotNegative = 1.0
     positions_mm: tuple[float, ...] = ()
     direction: Direction = (1.0, 0.0, 0.0)
-
-    def standard(self) -> StepStandard:
-        """Return the artefact."""
-        return StepStandard.model_validate(self.model_dump(include=set(StepStandard.model_fields)))
 
 
 class GuidedPlan(RigPlan):
@@ -145,7 +137,7 @@ class GuidedPlan(RigPlan):
 
     def step_header(self, name: str, step: GuidedStep) -> CaptureHeader:
         """Return the header of the standard's capture; raises DescriptionError if sensor or medium are not valid."""
-        artefact = step.standard().model_dump(exclude_none=True)
+        artefact = step.model_dump(include=set(StepStandard.model_fields), exclude_none=True)
         return self.capture_header(
             name, self.described_sensor(), medium=step.medium, direction=step.direction, artefact=artefact
         )

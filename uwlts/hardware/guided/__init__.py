@@ -1,1 +1,0 @@
-"""Guided calibration with camera and stage: plan, requests to the operator, judgement, display and recording."""
