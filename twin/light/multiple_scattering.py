@@ -294,8 +294,8 @@ class SmoothLight:
     ) -> np.ndarray:
         """Return the light (P,) at rows and columns (P,), in cells, from the findings of ``walks`` at each place.
 
-        If the light found at a position is too noisy, the result follows from the ``features`` (J, P) there, their
-        weights, and the interpolated ratio of the cells to their description.
+        If the light found at a position is too noisy, the result follows from the ``features`` (J, P) there and their
+        weights. They are multiplied by the interpolated ratio of the cells to their description.
         """
         ratio = np.divide(self.cells, self.described, out=np.ones_like(self.cells), where=self.described > 0)
         expected = interpolate_cells(ratio, rows, columns) * (self.weights @ features)

@@ -282,8 +282,8 @@ def load_scene(
 ) -> Scene:
     """Read a scene by the name of a shipped one (``spheres``) or by path; the given values replace its own.
 
-    They are the names of one of the scene's placements and of one of the sensor's media, the name of a water or a
-    turbidity from 0 (pure) to 3 (harbour), and a motion of the sensor. A table is validated like one of the file.
+    ``placement`` and ``medium`` are names of the scene's placements and of the sensor's media. ``water`` is a name or a
+    turbidity from 0 (pure) to 3 (harbour). A table of the motion is validated like one of the file.
     """
     path = find_description(name_or_path)
     table: dict[str, object] = dict(read_table(path))

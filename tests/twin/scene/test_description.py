@@ -1,6 +1,6 @@
 """Scene descriptions: all shipped ones are valid, and every mistake is rejected with its name.
 
-Those of sensors are tested in `tests.uwlts.model.test_library`.
+The descriptions of sensors are tested in `tests.uwlts.model.test_library`.
 """
 
 import numpy as np
