@@ -1,7 +1,7 @@
 """The next pass: a motion of the sensor relative to the scene, and the uncertainty of lengths that it would leave."""
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,8 +20,11 @@ _LEAST_OVERLAP = 0.3
 """Smallest fraction of the cells that a candidate must see, so that poses and surface stay connected."""
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
 class NextPass(Candidate):
-    """A further pass; its pose is in the common frame."""
+    """A further pass, whose pose is in the common frame; ``single`` if it is one motion."""
+
+    single: bool
 
 
 def rank_passes(problem: PassProblem, solution: PassSolution, lengths: np.ndarray) -> list[Forecast[NextPass]]:
@@ -38,7 +41,7 @@ def _candidates(problem: PassProblem, solution: PassSolution) -> Iterator[NextPa
     each = weight / np.array([len(cell.passes) for cell in cells])
     rows = np.array([cell.mean_row for cell in cells])
     first = problem.passes[0]
-    for words, pose in _motions(first.pose[len(first.pose) // 2], places):
+    for words, pose, single in _motions(first.pose[len(first.pose) // 2], places):
         seen = _see(problem, solution, pose, places)
         if seen is None or np.count_nonzero(seen[1]) < _LEAST_OVERLAP * len(cells):
             continue
@@ -48,11 +51,11 @@ def _candidates(problem: PassProblem, solution: PassSolution) -> Iterator[NextPa
         by[:, :count] -= rows[there]
         information = (by.T / (1 / each[there] + 1 / weight[there]) / solution.spread**2) @ by
         information[count:, count:] += np.eye(len(information) - count)
-        yield NextPass(words=words, information=eliminate_others(information, count), pose=pose)
+        yield NextPass(words=words, information=eliminate_others(information, count), pose=pose, single=single)
 
 
-def _motions(start: np.ndarray, places: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    """Iterate over motions as text and their poses (4, 4), from the pose of the first pass."""
+def _motions(start: np.ndarray, places: np.ndarray) -> Iterator[tuple[str, np.ndarray, bool]]:
+    """Iterate over motions from the first pass: text, pose (4, 4), and whether it is a single motion."""
     axes, middle = start[:3, :3], places.mean(axis=0)
     width = float(np.ptp((places - middle) @ axes[:, 1]))
     shifts = [sign * round(part * width, -1) or sign * 5.0 for part in _SHIFTS for sign in (1, -1)]
@@ -64,12 +67,12 @@ def _motions(start: np.ndarray, places: np.ndarray) -> Iterator[tuple[str, np.nd
         (f"roll by {sign * deg:+.0f} deg about X", sign * deg * axes[:, 0]) for deg in _ROLLS_DEG for sign in (1, -1)
     ]
     for words, vector in (*steps, *lifted):
-        yield words, rigid_transform(np.eye(3), vector) @ start
+        yield words, rigid_transform(np.eye(3), vector) @ start, True
     for words, vector in turns:
         rotation = Rotation.from_rotvec(vector, degrees=True).as_matrix()
         for also, shift in (("", np.zeros(3)), *((f"{lift} and ", shift) for lift, shift in lifted)):
             moved = rigid_transform(rotation, middle - rotation @ middle + shift)
-            yield f"{also}{words}, about the middle of the scene", moved @ start
+            yield f"{also}{words}, about the middle of the scene", moved @ start, not also
 
 
 def _see(

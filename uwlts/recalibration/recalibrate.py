@@ -190,12 +190,13 @@ class Recalibrated(Brief):
         }
 
     def advice(self) -> list[str]:
-        """Return the most helpful further passes as text."""
+        """Return the most helpful further pass, and the most helpful single motion, as text."""
         if not self.next_passes or self.next_passes[0].after > 0.95 * self.next_passes[0].before:
             return ["no single further pass would reduce the uncertainty of these lengths by a twentieth"]
         return [
             f"next pass: {each.candidate.words}: 100 mm then to {each.after:.3f} mm instead of {each.before:.3f} mm"
-            for each in self.next_passes[:3]
+            for number, each in enumerate(self.next_passes)
+            if number == 0 or each is next(one for one in self.next_passes if one.candidate.single)
         ]
 
 
