@@ -455,8 +455,14 @@ def _answer(work: Callable[[], str]) -> Callable[[Any, Any], Any]:
 def _import_ros() -> tuple[Any, ...]:
     """Return rclpy, its executors, and the modules of the messages and of the service."""
     try:
-        names = "rclpy", "rclpy.executors", "sensor_msgs.msg", "std_msgs.msg", "builtin_interfaces.msg", "std_srvs.srv"
-        return tuple(import_module(name) for name in names)
+        return (
+            import_module("rclpy"),
+            import_module("rclpy.executors"),
+            import_module("sensor_msgs.msg"),
+            import_module("std_msgs.msg"),
+            import_module("builtin_interfaces.msg"),
+            import_module("std_srvs.srv"),
+        )
     except ImportError as error:
         raise SetupError(
             f"uwlts ros needs ROS 2 for Python, which cannot be imported ({error}): source an installation for "

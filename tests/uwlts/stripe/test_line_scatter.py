@@ -15,7 +15,7 @@ SIMPLE = [name for name in method_names() if name != StripeOptions().method]
 def scatter(centre: np.ndarray) -> float:
     """Return the mean distance, px, of centres from parabolas through the twelve lines on either side, left out.
 
-    A fit by another routine, over other lines than those of `uwlts.stripe.line_scatter`.
+    A fit by another routine, over other lines than those of `uwlts.stripe.methods.profile_fit`.
     """
     found = []
     for line in range(12, len(centre) - 12):

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from functools import lru_cache
+from types import ModuleType
 
 import numpy as np
 
 from uwlts.runtime.compiled import compiled, compiled_inline, compiled_part
-from uwlts.stripe.line_scatter import least_scattered
 from uwlts.stripe.methods import centre_of_mass, quadratic, zero_crossing
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA, WINDOW_RULE, PeakWindow, exponential
 
@@ -101,7 +102,7 @@ def centres(peak: PeakWindow) -> np.ndarray:
 
     Real flanks may be no Gaussian for other reasons, such as flare, texture, sharpening or compression by the camera.
     The noise model then gives them too much weight. Another method is used for all lines if it scatters less along the
-    stripe (`uwlts.stripe.line_scatter`).
+    stripe.
     """
     sampled = np.arange(0, peak.start.size, max(1, peak.start.size // _SAMPLED))
     flanks = np.zeros(sampled.size, np.float32)
@@ -117,7 +118,7 @@ def centres(peak: PeakWindow) -> np.ndarray:
     _fit_profiles(peak, noise, sampled, signal, known, sums[0], centre, flat)
     if flat.any():
         centre[flat] = quadratic.centres(peak.select(flat))
-    return least_scattered(peak, centre, zero_crossing, (quadratic, centre_of_mass))
+    return _select_least_scattered(peak, centre)
 
 
 def _allocate_aligned(*shapes: tuple[int, int]) -> Iterator[np.ndarray]:
@@ -318,3 +319,118 @@ def _update_fit(known: np.ndarray, sums: np.ndarray) -> None:
         known[_CENTRE + k] = min(max(moved, known[_FIRST + k]), known[_LAST + k])
         broad = min(known[_SIGMA + k] * exponential(wider), known[_WIDEST + k])
         known[_SIGMA + k] = max(broad, np.float32(_NARROWEST))
+
+
+_LARGEST_PX = 3.0
+"""Limit of the distances from parabolas; larger ones are due to edges and would conceal the others. Squares, as in the
+fits for which the centres are used."""
+
+
+class _Comparison:
+    """Numbers of the comparison with simple methods on the stripe at hand, chosen for the reasons below.
+
+    ``reach``, ``run`` and the use of squares were chosen on the real stripes of docs/results/stripe-methods.md, where
+    the result is compared on drawn stripes that were not used.
+    """
+
+    reach: int = 12
+    """Lines on either side of a line, through whose centres a parabola is fitted. Surfaces are smooth over them, and
+    errors by texture and flare are longer than a few lines."""
+    # Consecutive lines of a run, and number of runs. Their 320 evaluated lines compare methods to some percent, and the
+    # comparison costs little more than the fit of an image.
+    run: int = 64
+    runs: int = 8
+    fewest: int = 64
+    """Fewest evaluated lines. With fewer lines the difference of two methods may be chance."""
+    advantage: float = 1.3
+    """Ratio of the scatters of the zero crossing and the profile fit above which the noise model describes the stripe:
+    the ratio is 2 in speckle and 1 in white noise. Half of the runs are used, so that speckle costs little time."""
+    # Least gain by another method, relative and in px. Methods that differ less would be exchanged by chance from image
+    # to image. Errors of 0.005 px with the pixel phase (`WindowRule.least_kernel`) are no scatter if the stripe is
+    # inclined little: their root mean square is the least gain.
+    gain: float = 0.02
+    gain_px: float = 0.0035
+    narrowest: float = WINDOW_RULE.least_kernel
+    """Least median sigma of a stripe, px. The simple methods pull the centres of narrower stripes to the pixels'
+    middles, which lowers their scatter."""
+    jump: float = 0.2
+    """Largest distance of neighbouring centres, as a fraction of the window; other lines belong to two surfaces."""
+
+
+def _select_least_scattered(peak: PeakWindow, centre: np.ndarray) -> np.ndarray:
+    """Return the given centres (M,), or those of a simple method that scatters less along the stripe.
+
+    All methods are compared only if the given centres lack their advantage over the zero crossing. ``peak`` are windows
+    of M lines in their order.
+    """
+    rows, others = _select_runs(peak.start.size), (zero_crossing, quadratic, centre_of_mass)
+    # The median of the lines that are compared, because only their scatter decides; counting is faster than sorting.
+    narrow = np.count_nonzero(peak.sigma[rows[::2]] < _Comparison.narrowest)
+    if rows.shape[1] <= 2 * _Comparison.reach or 2 * narrow > rows[::2].size:
+        return centre
+    own, of_first = _measure_scatters(peak, centre, rows[::2], zero_crossing)
+    if not of_first <= _Comparison.advantage * own:
+        return centre
+    own, *scatters = _measure_scatters(peak, centre, rows, *others)
+    best = int(np.argmin(scatters))
+    if not own - scatters[best] > max(_Comparison.gain * own, _Comparison.gain_px):
+        return centre
+    return others[best].centres(peak)
+
+
+def _measure_scatters(peak: PeakWindow, centre: np.ndarray, rows: np.ndarray, *others: ModuleType) -> list[float]:
+    """Return the root mean square distance, px, from parabolas through neighbours: of centres, and of other methods.
+
+    ``rows`` (R, K) are the lines of R runs. The distances are NaN if too few lines belong to a smooth stripe.
+    """
+    some, weights = peak.select(rows.ravel()), _residual_weights(_Comparison.reach)
+    middle = (some.start + some.middle).reshape(rows.shape).astype(float)
+    scatters = []
+    for values in (centre[rows.ravel()], *(other.centres(some) for other in others)):
+        place = (some.start + values.astype(float)).reshape(rows.shape)
+        total, count = _sum_squares(middle, place, weights, _Comparison.jump * peak.window.shape[1])
+        scatters.append(math.sqrt(total / count) if count >= _Comparison.fewest else math.nan)
+    return scatters
+
+
+@compiled
+def _sum_squares(middle: np.ndarray, place: np.ndarray, weights: np.ndarray, jump_px: float) -> tuple[float, int]:
+    """Return the sum of the squared, limited residuals of places (R, K), and the number of lines on smooth stripes.
+
+    The residual of a line is the sum of its neighbours' places with the weights (2 reach + 1,). A stripe is smooth if
+    the middles (R, K) of neighbouring lines are nowhere farther apart than ``jump_px``.
+    """
+    reach, total, count = weights.size // 2, 0.0, 0
+    for row in range(place.shape[0]):
+        broken = -1
+        for line in range(1, place.shape[1]):
+            if abs(middle[row, line] - middle[row, line - 1]) > jump_px:
+                broken = line
+            at = line - reach
+            if at < reach or broken > at - reach:
+                continue
+            residual = 0.0
+            for k in range(weights.size):
+                residual += weights[k] * place[row, at - reach + k]
+            total += min(abs(residual), _LARGEST_PX) ** 2
+            count += 1
+    return total, count
+
+
+@lru_cache(maxsize=16)
+def _select_runs(count: int) -> np.ndarray:
+    """Return the indices (R, K) of runs spread over ``count`` lines, or all lines as one run if they are few."""
+    if count <= _Comparison.run * _Comparison.runs:
+        return np.arange(count)[None]
+    return np.linspace(0, count - _Comparison.run, _Comparison.runs).astype(np.intp)[:, None] + np.arange(
+        _Comparison.run
+    )
+
+
+@lru_cache
+def _residual_weights(reach: int) -> np.ndarray:
+    """Return weights (2 R + 1,) of centres that give the middle one's distance from their least-squares parabola."""
+    powers = np.vander(np.arange(-reach, reach + 1, dtype=float), 3)
+    weights = -np.linalg.pinv(powers)[-1]
+    weights[reach] += 1.0
+    return weights
