@@ -34,10 +34,10 @@ def choose_points(
     if field == "depth":
         return CloudPoints(points_mm[chosen], field, None, "mm", None), f"{caption} {axes}"
     values = np.full(count, np.nan) if values is None else values.astype(np.float64)
-    values, unit, limit = scale_values(values, field)
+    scaled, unit, limit = scale_values(values, field)
     if limit is not None:
         caption += f" The colours end at {LIMIT_STD:g} standard deviations, ±{limit:.3g} {unit}."
-    if np.isnan(shown := values[chosen]).any():
+    if np.isnan(shown := scaled[chosen]).any():
         caption += " Dark points were not evaluated: outliers, near an edge, or beside the artefact." if limit else ""
     caption += f" {PARTS[field]}" if field in PARTS else ""
     return CloudPoints(points_mm[chosen], field, shown, unit, limit), f"{caption} {axes}"
