@@ -17,7 +17,8 @@ from uwlts.calibration.sequential.sheet_fit import object_frame
 from uwlts.errors import CalibrationError
 from uwlts.fitting.least_squares import biweight
 from uwlts.model.artefacts import Artefact
-from uwlts.model.calibration import Calibration, rigid_transform
+from uwlts.model.calibration import Calibration, calibration_digest, rigid_transform
+from uwlts.model.mount import Mount, SensorShare
 from uwlts.recalibration.known_lengths import KnownLengths, measure_known_lengths
 from uwlts.recalibration.surface_cells import Cell, PassPoints, divide, observe
 
@@ -29,6 +30,8 @@ _SETTLED = 0.05
 _DETERMINED = 0.3
 """Least fraction of a prior variance that the passes remove in a direction whose deviation is tested. In weaker
 directions, ripples of welds alone deviated by 10 standard deviations (seeds 3 and 8 of the study)."""
+_NEGLIGIBLE = 1e-12
+"""Smallest eigenvalue of the parameters' correlations that is no rounding error."""
 POOR_FIT = 2.0
 """Disagreement of passes relative to their noise above which the surface is not the same in all passes."""
 OF_PASS = 7
@@ -348,3 +351,65 @@ def chance(amplitudes: np.ndarray, covariance: np.ndarray, directions: np.ndarra
     tested = values > _DETERMINED
     square = float(np.sum((vectors.T @ own)[tested] ** 2 / values[tested]))
     return float(chdtrc(int(tested.sum()), square)) if tested.any() else 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class MovedMount:
+    """Mount after the passes, and its change (7,) with standard uncertainties before and after: mm, rad, s."""
+
+    mount: Mount
+    change: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+
+    def lines(self) -> list[str]:
+        """Describe the change."""
+        rows = [("position", "mm", slice(0, 3), 1.0), ("direction", "deg", slice(3, 6), float(np.degrees(1.0)))]
+        rows += [("clock offset", "ms", slice(6, 7), 1e3)] if self.before[6] > 0 else []
+        lines = []
+        for name, unit, part, factor in rows:
+            values = (factor * each[part] for each in (self.change, self.before, self.after))
+            moved, before, after = (", ".join(f"{value:.3f}" for value in each) for each in values)
+            lines.append(f"mount, {name}: changed by {moved} {unit}; standard uncertainty {before} before, {after} now")
+        return lines
+
+
+def move_mount(mount: Mount, problem: PassProblem, solution: PassSolution, calibration: Calibration) -> MovedMount:
+    """Return the mount for the OCS of the new calibration, with their correlation."""
+    assert problem.mount is not None
+    by, count = problem.mount.by, problem.root.shape[1]
+    components, covariance = solution.amplitudes[:count], solution.covariance[:count, :count]
+    moved = problem.moved(solution.amplitudes)
+    # The sheet defines the OCS, which moves with it; the mount's change belongs to the OCS of the earlier calibration.
+    corrected = problem.mount.correction(components) @ problem.earlier_from_moved(moved)
+    transform = problem.mount.transform @ corrected
+    lever = problem.mount.transform[:3, :3] @ corrected[:3, 3]
+    in_place = by.copy()
+    in_place[:3] += np.cross(by[3:6].T, lever).T
+    of_mount = in_place @ covariance @ in_place.T
+    shared, of_parameters = in_place @ covariance @ problem.root.T, problem.root @ covariance @ problem.root.T
+    std = np.sqrt(np.diag(of_parameters))
+    inverse = np.linalg.pinv(of_parameters / np.outer(std, std), rcond=_NEGLIGIBLE, hermitian=True)
+    by_parameters = shared[:6] @ (inverse / np.outer(std, std))
+    apart = of_mount[:6, :6] - by_parameters @ shared[:6].T
+    changes = {
+        "T_platform_sensor": transform,
+        "covariance": 0.5 * (of_mount + of_mount.T)[:6, :6],
+        "sensor": SensorShare(
+            calibration=calibration_digest(calibration),
+            by_parameters=tuple(map(tuple, by_parameters.tolist())),
+            covariance_apart=tuple(map(tuple, (0.5 * (apart + apart.T)).tolist())),
+        ),
+    }
+    change = by @ components
+    if mount.time_offset_std_s:
+        changes["time_offset_s"] = (mount.time_offset_s or 0.0) + float(change[6])
+        changes["time_offset_std_s"] = float(np.sqrt(of_mount[6, 6]))
+    if mount.robot_scale is not None:
+        scale = problem.motion.pose_scale
+        changes["robot_scale"] = mount.robot_scale * (1.0 + scale * float(solution.amplitudes[count]))
+        changes["robot_scale_std"] = scale * float(np.sqrt(solution.covariance[count, count]))
+    for name in ("T_platform_sensor", "covariance"):
+        changes[name] = tuple(map(tuple, np.asarray(changes[name]).tolist()))
+    before, after = np.linalg.norm(by, axis=1), np.sqrt(np.einsum("iu,uv,iv->i", by, covariance, by))
+    return MovedMount(mount.model_copy(update=changes), change, before, after)

@@ -22,17 +22,18 @@ from uwlts.model.short_text import Brief
 from uwlts.model.trajectory import Trajectory
 from uwlts.optics.brightness import select_sharp_lines
 from uwlts.recalibration.as_built import as_built
-from uwlts.recalibration.moved_mount import MovedMount, move_mount
 from uwlts.recalibration.next_pass import NextPass, rank_passes
 from uwlts.recalibration.pass_check import split_passes
 from uwlts.recalibration.pass_estimate import (
     POOR_FIT,
     MotionUncertainty,
     MountErrors,
+    MovedMount,
     Pass,
     PassProblem,
     PassSolution,
     chance,
+    move_mount,
     solve_passes,
 )
 from uwlts.recalibration.surface_cells import CELL, LINES, Cell

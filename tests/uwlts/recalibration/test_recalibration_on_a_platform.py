@@ -26,8 +26,7 @@ from uwlts.model.mount import Mount
 from uwlts.model.placement import camera_from_object
 from uwlts.model.trajectory import Trajectory
 from uwlts.recalibration.as_built import as_built
-from uwlts.recalibration.moved_mount import move_mount
-from uwlts.recalibration.pass_estimate import Pass, PassProblem, solve_passes
+from uwlts.recalibration.pass_estimate import Pass, PassProblem, move_mount, solve_passes
 from uwlts.recalibration.recalibrate import _add_mount, summarise
 from uwlts.reconstruction.point_uncertainty import independent_components
 from uwlts.reconstruction.reconstruct import reconstruct
