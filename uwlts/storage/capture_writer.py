@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from io import BufferedReader
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import h5py
 import hdf5plugin
@@ -244,7 +244,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         self._claim_space()
         line = stack_rows(frame.seen) if isinstance(frame.seen, Stripe) else None
         # Chunks of a dataset that are not written take no space.
-        values: dict[str, object] = {"frames": frame.seen if line is None else None} | (
+        values: dict[str, Any] = {"frames": frame.seen if line is None else None} | (
             {"centre_lines": line} if self._lines else {}
         )
         known = vars(frame) | {"has_image": line is None}

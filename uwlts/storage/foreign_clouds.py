@@ -102,7 +102,7 @@ def _write_e57(aside: Path, cloud: PointCloud, colours: Colours, path: Path) -> 
         )
     # Rounded first, so that the bounds in the file apply to the numbers in the file.
     coordinates = (1e-3 * cloud.points_mm).astype(np.float32).astype(np.float64).T
-    columns = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), coordinates, strict=True))
+    columns: dict[str, Any] = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), coordinates, strict=True))
     if not unknown.any():
         columns["intensity"] = cloud.intensity
     if colours is not None:

@@ -130,7 +130,6 @@ def read_image(path: Path, *, accept: Callable[[ImageHeader], None] = lambda dec
     content = read_bytes(path, most_bytes=_MOST_BYTES, error=ImageError, called="image")
     declared = read_header(content, path)
     accept(declared)
-    kind = declared.kind
     try:
         with _capture_damage() as said:
             image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -139,7 +138,7 @@ def read_image(path: Path, *, accept: Callable[[ImageHeader], None] = lambda dec
     damage = " ".join(_AROUND.sub("", said[0].strip()).split()) if said else ""
     if image is None or damage:
         found = f"{len(content)} bytes" + (f", its decoder says: {damage}" if damage else "")
-        raise ImageError(f"{path} is a {kind} file that is truncated or damaged ({found}); copy it again")
+        raise ImageError(f"{path} is a {declared.kind} file that is truncated or damaged ({found}); copy it again")
     if declared.several_pages:
         raise ImageError(f"{path} holds several pages; expected one image per file: split it")
     if image.dtype not in (np.uint8, np.uint16):

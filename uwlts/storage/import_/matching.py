@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 
@@ -93,7 +94,7 @@ def _row(number: int, cells: dict[str, str], place: str) -> ImageRow:
     light = texts["light"].lower() or None
     if light is not None and light not in _LIGHTS:
         raise DescriptionError(f"{place}: the light is {light!r}; expected {', '.join(_LIGHTS)}")
-    numbers = {name: _number(texts[name], f"{place}: {name}") for name in (*_NUMBERS, *POSE_COLUMNS)}
+    numbers: dict[str, Any] = {name: _number(texts[name], f"{place}: {name}") for name in (*_NUMBERS, *POSE_COLUMNS)}
     pose = np.array([numbers.pop(name) for name in POSE_COLUMNS]).reshape(4, 4)
     given = np.count_nonzero(np.isfinite(pose))
     if given not in (0, 16):
