@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from uwlts.calibration.joint.observability import compute_lengths, project_sheet_points, sample_sheet
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, read_stored_estimate, require_joint
@@ -369,8 +370,7 @@ def _gather(
     cloud = reconstruct_stripes(table, stripes, prior)
     key = stripes.frame.astype(np.int64) * (1 + int(stripes.line.max())) + stripes.line
     wanted = cloud.frame.astype(np.int64) * (1 + int(stripes.line.max())) + cloud.line
-    order = np.argsort(key)
-    chosen = order[np.searchsorted(key[order], wanted)]
+    chosen = np.flatnonzero(np.isin(key, wanted))
     kept, blur = stripes[chosen], blur[chosen]
     noise = estimate_stripe_noise_px(kept.frame, kept.line, kept.centre_px)
     pass_of = split_passes(cloud) if pose is None else np.zeros(len(cloud.frame), int)
@@ -394,22 +394,12 @@ def _gather(
         # The rates are those of the platform's origin.
         lever = own[:, :3, 3] - table.pose[:, :3, 3]
         rates = np.hstack([rates[:, :3] + np.cross(rates[:, 3:], lever), rates[:, 3:]])
+    values = kept.frame, kept.line, kept.centre_px.astype(np.float64), noise, beside, travel
     passes, numbers = [], np.unique(pass_of)
     for number in numbers:
         some = even & (pass_of == number)
-        passes.append(
-            Pass(
-                scan.path.name if len(numbers) == 1 else f"{scan.path.name}, pass {number + 1}",
-                kept.frame[some],
-                kept.line[some],
-                kept.centre_px[some].astype(np.float64),
-                noise[some],
-                beside[some],
-                travel[some],
-                own,
-                rates,
-            )
-        )
+        name = scan.path.name if len(numbers) == 1 else f"{scan.path.name}, pass {number + 1}"
+        passes.append(Pass(name, *(each[some] for each in values), own, rates))
     return passes, list(cloud.warnings)
 
 
@@ -421,8 +411,7 @@ def _add_mount(
     A mount that was estimated with the same calibration has a part of its errors in common with it.
     """
     apart, common = mount.independent_covariance(calibration_digest(prior))
-    own = np.zeros((7, 7))
-    own[:6, :6], own[6, 6] = CovarianceRoot.from_covariance(apart).root, mount.time_offset_std_s or 0.0
+    own = block_diag(CovarianceRoot.from_covariance(apart).root, mount.time_offset_std_s or 0.0)
     by = np.zeros((7, root.shape[1]))
     if common is not None:
         by[:6] = common @ root[: common.shape[1]]
