@@ -96,7 +96,8 @@ def fit_smooth_map(start: np.ndarray, end: np.ndarray) -> SmoothMap:
 
 def _terms(points: np.ndarray, low: np.ndarray, high: np.ndarray, degree: int) -> np.ndarray:
     """Return products of Legendre polynomials in both coordinates up to a total degree, (M, terms)."""
-    products = legendre.legvander2d(*_scale_range(points, low, high).T, [degree, degree])
+    x, y = _scale_range(points, low, high).T
+    products = legendre.legvander2d(x, y, [degree, degree])
     powers = np.add.outer(np.arange(degree + 1), np.arange(degree + 1)).ravel()
     return products[:, powers <= degree]
 
