@@ -14,7 +14,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from uwlts.model.calibration import Calibration
@@ -24,6 +23,7 @@ from uwlts.model.stripe import CaptureStripes, stack_pixels
 from uwlts.optics.line_table import LineTable
 from uwlts.optics.triangulation import MeasuredPoints, rays_on_sheet, to_object
 from uwlts.optics.window import RayStatus
+from uwlts.runtime.compiled import compiled, compiled_with_arrays
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA
 
 BLUR_STD = 1.0 / math.sqrt(3.0)
@@ -246,18 +246,14 @@ def estimate_blur_shift_px(
     The squared stripe width, corrected for the stripe's tilt in the image, is an upper limit of b^2. Centres may be in
     any order; amplitudes are positive, and widths full widths at half maximum.
     """
-    _, row = np.unique(frame, return_inverse=True)
-
-    def fit_slopes(values: np.ndarray, reach: int) -> np.ndarray:
-        """Return the slopes (N,) per line of straight lines fitted to values within ``reach`` lines of an image."""
-        there, x, z, place = _arrange(row, line, values)
-        count, covariance = _window_covariances(there, (0, reach), x, z)
-        square = covariance(0, 0)
-        known = (count > _LEAST_SHARE * (2 * reach + 1)) & (square > 1.0)
-        return np.divide(covariance(0, 1), square, out=np.zeros_like(square), where=known)[place]
-
-    lean = fit_slopes(centre_px, _BEND_LINES)
-    bend, fading = fit_slopes(lean, _BEND_LINES), fit_slopes(np.log(amplitude), _LINES)
+    if np.any((frame[1:] < frame[:-1]) | ((frame[1:] == frame[:-1]) & (line[1:] < line[:-1]))):
+        order, moved = np.lexsort((line, frame)), np.empty(len(line))
+        columns = frame, line, centre_px, amplitude, width_px
+        moved[order] = estimate_blur_shift_px(*(column[order] for column in columns))
+        return moved
+    lean = _slopes_along(frame, line, centre_px, _BEND_LINES)
+    bend = _slopes_along(frame, line, lean, _BEND_LINES)
+    fading = _slopes_along(frame, line, np.log(amplitude), _LINES)
     variance = (width_px / FWHM_PER_SIGMA) ** 2 / (1.0 + lean**2)
     return variance * (lean * fading + 0.5 * bend)
 
@@ -276,54 +272,100 @@ def select_sharp_lines(stripes: CaptureStripes) -> tuple[np.ndarray, np.ndarray]
     return sharp, moved[sharp]
 
 
+def _slopes_along(frame: np.ndarray, line: np.ndarray, values: np.ndarray, reach: int) -> np.ndarray:
+    """Return the slopes (N,) per line of straight lines fitted to values within ``reach`` lines of the same image.
+
+    The values are sorted by image and line.
+    """
+    slopes = np.zeros(len(line))
+    _fit_lines(frame, line, np.ascontiguousarray(values, dtype=float), reach, slopes)
+    return slopes
+
+
+@compiled
+def _fit_lines(frame: np.ndarray, line: np.ndarray, values: np.ndarray, reach: int, slopes: np.ndarray) -> None:
+    """Write the slopes (N,) that can be fitted into ``slopes``, with running sums over the lines."""
+    first, last, n, x1, x2, z1, xz = 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0
+    origin, base = 0, 0.0
+    for k in range(line.size):
+        if k == 0 or frame[k] != frame[k - 1]:
+            first, last, n, x1, x2, z1, xz = k, k, 0.0, 0.0, 0.0, 0.0, 0.0
+            origin, base = line[k], values[k]
+        while last < line.size and frame[last] == frame[k] and line[last] <= line[k] + reach:
+            x, z = float(line[last] - origin), values[last] - base
+            n, x1, x2, z1, xz, last = n + 1.0, x1 + x, x2 + x * x, z1 + z, xz + x * z, last + 1
+        while line[first] < line[k] - reach:
+            x, z = float(line[first] - origin), values[first] - base
+            n, x1, x2, z1, xz, first = n - 1.0, x1 - x, x2 - x * x, z1 - z, xz - x * z, first + 1
+        square = x2 / n - (x1 / n) ** 2
+        if n > _LEAST_SHARE * (2 * reach + 1) and square > 1.0:
+            slopes[k] = (xz / n - x1 / n * z1 / n) / square
+
+
 def _slopes_by_position(
     row: np.ndarray, column: np.ndarray, values: np.ndarray, position: np.ndarray, *, rows: int
 ) -> np.ndarray:
     """Return the slopes (N,) per position of planes fitted to the values within ``rows`` images."""
-    there, x, z, place = _arrange(row, column, values)
+    first = column.min()
+    shape = len(position), int(column.max() - first) + 1
+    there, z, slopes = np.zeros(shape, np.bool_), np.zeros(shape), np.zeros(shape)
+    place = row * shape[1] + (column - first)
+    there.ravel()[place] = True
+    z.ravel()[place] = values - values.mean()
     # Images at nearly the same stage position do not determine the slope.
     least = max(0.15 * (np.median(position[rows:] - position[:-rows]) / rows) ** 2, _LEAST_APART_MM**2)
-    count, covariance = _window_covariances(there, (rows, _LINES), (position - position.mean())[:, None], x, z)
-    xx, ss, sx = covariance(1, 1), covariance(0, 0), covariance(0, 1)
-    of_both = ss * xx - sx * sx
-    known = (count > _LEAST_SHARE * (2 * rows + 1) * (2 * _LINES + 1)) & (xx > 1.0)
-    known &= (ss > least) & (ss < _REACH_MM**2) & (of_both > 1e-3 * ss * xx)
-    change = covariance(0, 2) * xx - covariance(1, 2) * sx
-    return np.divide(change, of_both, out=np.zeros_like(z), where=known)[place]
+    _fit_planes(there, z, position - position.mean(), rows, _LINES, least, slopes)
+    return slopes.ravel()[place]
 
 
-def _arrange(
-    row: np.ndarray, column: np.ndarray, values: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Arrange values (N,) by row and column: where there is one (F, L), columns (L,), values (F, L), and their places.
+@compiled_with_arrays
+def _fit_planes(
+    there: np.ndarray, z: np.ndarray, s: np.ndarray, rows: int, columns: int, least: float, slopes: np.ndarray
+) -> None:
+    """Write slopes (F, L) of planes fitted to the values z (F, L) marked by ``there``, at positions s (F,).
 
-    Columns and values are relative to their means, which lowers rounding errors.
+    Running sums over the window, first along each row, then from row to row. Unknown slopes stay as they are.
     """
-    place = row, column - column.min()
-    z = np.zeros((int(row.max()) + 1, int(place[1].max()) + 1))
-    there = np.zeros_like(z)
-    there[place], z[place] = 1.0, values - values.mean()
-    return there, np.arange(z.shape[1]) - 0.5 * z.shape[1], z, place
-
-
-def _window_covariances(
-    there: np.ndarray, reach: tuple[int, int], *quantities: np.ndarray
-) -> tuple[np.ndarray, Callable[[int, int], np.ndarray]]:
-    """Return the number (F, L) of values in the window around each place, and a function for covariances in it.
-
-    ``there`` (F, L) is 1 at values and 0 elsewhere. The window extends by ``reach`` rows and columns. The function
-    returns the covariance (F, L) of two quantities, given by their numbers; quantities are (F, L), (F, 1) or (L,).
-    """
-
-    def total(values: np.ndarray) -> np.ndarray:
-        size = 2 * reach[1] + 1, 2 * reach[0] + 1
-        return cv2.boxFilter(there * values, cv2.CV_64F, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
-
-    count = total(there)
-    number = np.maximum(count, 1.0)
-    means = [total(each) / number for each in quantities]
-
-    def covariance(i: int, j: int) -> np.ndarray:
-        return total(quantities[i] * quantities[j]) / number - means[i] * means[j]
-
-    return count, covariance
+    count, width = there.shape
+    along = np.zeros((count, 5, width))
+    for row in range(count):
+        n, x1, x2, z1, xz = 0.0, 0.0, 0.0, 0.0, 0.0
+        for k in range(width + columns):
+            for at, sign in ((k, 1.0), (k - 2 * columns - 1, -1.0)):
+                if 0 <= at < width and there[row, at]:
+                    x, value = at - 0.5 * width, z[row, at]
+                    n, x1, x2 = n + sign, x1 + sign * x, x2 + sign * x * x
+                    z1, xz = z1 + sign * value, xz + sign * x * value
+            if k >= columns:
+                to = along[row, :, k - columns]
+                to[0], to[1], to[2], to[3], to[4] = n, x1, x2, z1, xz
+    size = (2 * rows + 1) * (2 * columns + 1)
+    total = np.zeros((9, width))
+    for k in range(count + rows):
+        for row, sign in ((k, 1.0), (k - 2 * rows - 1, -1.0)):
+            if 0 <= row < count:
+                for at in range(width):
+                    n, x1, z1 = sign * along[row, 0, at], sign * along[row, 1, at], sign * along[row, 3, at]
+                    total[0, at] += n
+                    total[1, at] += x1
+                    total[2, at] += sign * along[row, 2, at]
+                    total[3, at] += z1
+                    total[4, at] += sign * along[row, 4, at]
+                    total[5, at] += s[row] * n
+                    total[6, at] += s[row] * s[row] * n
+                    total[7, at] += s[row] * x1
+                    total[8, at] += s[row] * z1
+        if k < rows:
+            continue
+        for at in range(width):
+            n = total[0, at]
+            if not there[k - rows, at] or n <= _LEAST_SHARE * size:
+                continue
+            mx, mz, ms = total[1, at] / n, total[3, at] / n, total[5, at] / n
+            xx, xz = total[2, at] / n - mx * mx, total[4, at] / n - mx * mz
+            if xx <= 1.0:
+                continue
+            ss, sx, sz = total[6, at] / n - ms * ms, total[7, at] / n - ms * mx, total[8, at] / n - ms * mz
+            of_both = ss * xx - sx * sx
+            if least < ss < _REACH_MM**2 and of_both > 1e-3 * ss * xx:
+                slopes[k - rows, at] = (sz * xx - xz * sx) / of_both
