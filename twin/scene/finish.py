@@ -259,14 +259,15 @@ def register_textures() -> None:
         def __init__(self, props: mi.Properties):
             ExactTexture.__init__(self, props)
             plate = cast(PrintedPlate, TypeAdapter(AnyObject).validate_json(str(props["plate"])))
-            self.average = props["scale"] * plate.background_reflectance()
+            scale = cast(float, props["scale"])
+            self.average = scale * plate.background_reflectance()
             target, (first, last) = plate.described_target(), plate.bounds_mm()
             self.middle, self.size, self.first = ((first + last) / 2).tolist(), (last - first).tolist(), first.tolist()
             self.points_end = target.indices.max(axis=0).tolist()
             corner, beside = target.points_at(np.array([(0, 0), (1, 1)]))[:, :2]
             self.corner_point, self.spacing = corner.tolist(), (beside - corner).tolist()
             self.shift_mm = to_jit(draw_print_errors(plate).ravel())
-            patches = _patch_table(plate, props["scale"])
+            patches = _patch_table(plate, scale)
             lists, self.cell_mm = _patches_by_cell(patches, first, last)
             self.rows, self.columns, self.depth = lists.shape
             self.patches = to_jit(patches[lists])

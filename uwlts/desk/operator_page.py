@@ -339,7 +339,7 @@ class _OperatorPage:
         with ui.row().classes("gap-1"):
             for by in _JOGS_MM:
                 label = f"{by:+g}".replace("-", "−")
-                self._button(label, partial(ask, device.jog, by), (InstrumentState.READY,)).props(
+                self._button(label, partial(ask, partial(device.jog, by)), (InstrumentState.READY,)).props(
                     f'outline dense aria-label="move by {by:+g} mm"'
                 )
         with ui.row().classes("items-center"):

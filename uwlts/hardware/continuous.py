@@ -335,7 +335,8 @@ def _fit_line(reports: list[StageReport], at_s: np.ndarray) -> tuple[np.ndarray,
     longest = max(_SLOW_REPORT * took[0], took[max(len(reports) // 2, _FEWEST_REPORTS - 1)])
     used = [each for each in reports if each.answered_s - each.asked_s <= longest]
     times, places = np.array([_time_of(each) for each in used]), np.array([each.position_mm for each in used])
-    middle, kept = times.mean(), np.ones(len(used), bool)
+    middle, kept, speed, start = times.mean(), np.ones(len(used), bool), 0.0, 0.0
+    away, fitted = places, kept
     for _ in range(3):
         speed, start = np.polyfit(times[kept] - middle, places[kept], 1)
         away, fitted = places - (start + speed * (times - middle)), kept

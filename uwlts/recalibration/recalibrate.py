@@ -399,7 +399,7 @@ def _gather(
     for number in numbers:
         some = even & (pass_of == number)
         name = scan.path.name if len(numbers) == 1 else f"{scan.path.name}, pass {number + 1}"
-        passes.append(Pass(name, *(each[some] for each in values), own, rates))
+        passes.append(Pass(name, *(each[some] for each in values), pose=own, rates=rates))
     return passes, list(cloud.warnings)
 
 

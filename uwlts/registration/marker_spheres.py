@@ -52,7 +52,7 @@ def group_markers(scans: Sequence[Sequence[MarkerSphere]], reach_mm: float) -> l
         for marker in markers:
             means = [np.mean([each.centre_mm for each in group.values()], axis=0) for group in groups]
             away = [
-                np.inf if number in group else np.linalg.norm(mean - marker.centre_mm)
+                np.inf if number in group else float(np.linalg.norm(mean - marker.centre_mm))
                 for group, mean in zip(groups, means, strict=True)
             ]
             if away and min(away) < reach_mm:

@@ -165,7 +165,7 @@ class RegisteredScans(Brief):
             "open_movements": [
                 {"scan": self.names[each.scan], "movement": each.describe()} for each in self.open_movements
             ],
-            "pairs": [asdict(pair) | {"scans": [self.names[number] for number in pair.scans]} for pair in self.pairs],
+            "pairs": [{**asdict(pair), "scans": [self.names[number] for number in pair.scans]} for pair in self.pairs],
             "narrow_overlaps": [
                 {"scans": [self.names[first], self.names[second]], "patches": patches}
                 for first, second, patches in self.narrow_overlaps
