@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
+from itertools import combinations
 from pathlib import Path
 from typing import Any, Self
 
@@ -19,6 +20,7 @@ from uwlts.model.calibration import Calibration, KnownMedium, KnownStage, calibr
 from uwlts.model.library import load_sensor
 from uwlts.model.mount import Mount
 from uwlts.model.parameter_keys import ParameterKey
+from uwlts.model.sensor import CaptureHeader, Medium
 from uwlts.model.short_text import Brief
 from uwlts.model.trajectory import Trajectory
 from uwlts.optics.brightness import select_sharp_lines
@@ -274,10 +276,6 @@ def recalibrate(
     for name, std in (("pose_std_mm", pose_std_mm), ("pose_std_deg", pose_std_deg)):
         if not std > 0:
             raise RangeError(f"`{name}` is {std:g}; expected a positive number")
-    if isinstance(artefact, str | Path):
-        artefact = read_artefact(artefact)
-    elif isinstance(artefact, dict):
-        artefact = parse_artefact(artefact)
     given = (
         read_poses(Path(poses), pose_format=pose_format, unit=pose_unit)[0] if isinstance(poses, str | Path) else poses
     )
@@ -288,46 +286,83 @@ def recalibrate(
     mount = read_mount(mount) if isinstance(mount, str | Path) else mount
     if isinstance(trajectory, str | Path):
         trajectory = read_trajectory(trajectory, pose_format=pose_format, unit=pose_unit)
-    of_platform = mount is not None or trajectory is not None
-    if given is None and len(passes) == 1 and not of_platform:
-        given = np.eye(4)[None]
     with open_captures(passes) as scans:
-        if not scans:
-            raise CaptureError("no passes are given; a recalibration needs two or more")
-        header = scans[0].header
-        for scan in scans[1:]:
-            if scan.header.sensor != header.sensor or scan.header.medium != header.medium:
-                raise CaptureError(f"{scan.path.name} is of another sensor or medium than {scans[0].path.name}")
-        if isinstance(calibration, Calibration):
-            prior = calibration
-        elif Path(calibration).suffix == ".toml":
-            prior = as_built(load_sensor(calibration), header.medium)
-        else:
-            prior = read_calibration(calibration)
-        require_joint(prior)
-        gathered, warnings = list[Pass](), []
+        header = _common_header(scans)
+        prior = _read_prior(calibration, header.medium)
+        gathered, warnings = list[Pass](), list[str]()
         for number, scan in enumerate(scans):
-            table, rates = scan, None
-            if of_platform:
+            own = None if given is None else given[number]
+            if mount is None and trajectory is None:
+                some, doubts = _gather(scan, scan, None, prior, own, stripe, alone=len(scans) == 1)
+            else:
                 ride = find_platform_poses(scan, trajectory, mount=mount, clock_offset_s=None)
-                table, rates = add_platform_poses(scan, ride, mount), ride.rates
-                warnings += ride.doubts
-            some, doubts = _gather(scan, table, rates, prior, None if given is None else given[number], stripe)
-            for each in gathered:
-                if any(np.array_equal(each.centre_px, one.centre_px) for one in some):
-                    raise CaptureError(f"{scan.path.name} holds the same stripes as {each.name}: give each pass once")
+                some, doubts = _gather(scan, add_platform_poses(scan, ride, mount), ride.rates, prior, None, stripe)
+                doubts = [*ride.doubts, *doubts]
             gathered += some
             warnings += [text if scan.path.name in text else f"{scan.path.name}: {text}" for text in doubts]
             progress(number + 1, len(scans) + 1)
         if mount is None and any(scan.header.T_platform_sensor is not None for scan in scans):
             warnings.append("the mount counts as exact: give `mount`, or state poses whose uncertainty contains it")
+    _refuse_repeated(gathered)
+    problem = _make_problem(gathered, prior, header, mount, pose_std_mm, pose_std_deg)
+    start = problem.place(np.zeros(problem.unknowns), [np.zeros(len(each.line)) for each in gathered])
+    radius = max(find_disc_radius(start.places_mm[start.number == each]) for each in range(len(gathered)))
+    solution = solve_passes(problem, size_mm=CELL * radius, artefact=_read_artefact(artefact))
+    progress(len(scans) + 1, len(scans) + 1)
+    found = summarise(problem, solution, prior, header.stage_direction)
+    moved = None if mount is None else move_mount(mount, problem, solution, found.calibration)
+    return replace(found, warnings=tuple(warnings), mount=moved)
+
+
+def _read_artefact(given: Artefact | dict[str, object] | str | Path | None) -> Artefact | None:
+    if isinstance(given, str | Path):
+        return read_artefact(given)
+    return parse_artefact(given) if isinstance(given, dict) else given
+
+
+def _read_prior(given: Calibration | str | Path, medium: Medium) -> Calibration:
+    """Return a joint calibration: as given, or of a sensor as it was built."""
+    if isinstance(given, Calibration):
+        prior = given
+    else:
+        built = Path(given).suffix == ".toml"
+        prior = as_built(load_sensor(given), medium) if built else read_calibration(given)
+    require_joint(prior)
+    return prior
+
+
+def _common_header(scans: Sequence[Capture]) -> CaptureHeader:
+    """Return the header of the first capture; CaptureError if another one is of another sensor or medium."""
+    if not scans:
+        raise CaptureError("no passes are given; a recalibration needs two or more")
+    header = scans[0].header
+    for scan in scans[1:]:
+        if scan.header.sensor != header.sensor or scan.header.medium != header.medium:
+            raise CaptureError(f"{scan.path.name} is of another sensor or medium than {scans[0].path.name}")
+    return header
+
+
+def _refuse_repeated(passes: Sequence[Pass]) -> None:
+    for one, other in combinations(passes, 2):
+        if np.array_equal(one.centre_px, other.centre_px):
+            raise CaptureError(f"{other.name} holds the same stripes as {one.name}: give each pass once")
+
+
+def _make_problem(
+    gathered: Sequence[Pass],
+    prior: Calibration,
+    header: CaptureHeader,
+    mount: Mount | None,
+    pose_std_mm: float,
+    pose_std_deg: float,
+) -> PassProblem:
     known = read_stored_estimate(prior, header.sensor, header.medium)
     root, by_stage = independent_components(known, prior, header)
     stated, on_platform = header.sensor.uncertainty, None
     if mount is not None:
         root, by_stage, on_platform = _add_mount(mount, prior, root, by_stage)
     scale = stated.stage_scale if mount is None or mount.robot_scale_std is None else mount.robot_scale_std
-    problem = PassProblem(
+    return PassProblem(
         gathered,
         known,
         root,
@@ -339,13 +374,6 @@ def recalibrate(
         np.vstack([each.pose[:, :3, 3] for each in gathered]).mean(axis=0),
         on_platform,
     )
-    start = problem.place(np.zeros(problem.unknowns), [np.zeros(len(each.line)) for each in gathered])
-    radius = max(find_disc_radius(start.places_mm[start.number == each]) for each in range(len(gathered)))
-    solution = solve_passes(problem, size_mm=CELL * radius, artefact=artefact)
-    progress(len(scans) + 1, len(scans) + 1)
-    found = summarise(problem, solution, prior, header.stage_direction)
-    moved = None if mount is None else move_mount(mount, problem, solution, found.calibration)
-    return replace(found, warnings=tuple(warnings), mount=moved)
 
 
 def _gather(
@@ -355,13 +383,18 @@ def _gather(
     prior: Calibration,
     pose: np.ndarray | None,
     stripe: StripeSettings,
+    *,
+    alone: bool = False,
 ) -> tuple[list[Pass], list[str]]:
     """Return the passes of a capture, and warnings.
 
-    ``table`` are its images with the poses of a platform, if there is one, with its ``rates`` (F, 6).
+    ``table`` are its images with the poses of a platform, if there is one, with its ``rates`` (F, 6). A capture
+    ``alone`` needs no poses.
     """
     of_frames = sensor_poses(table)
     posed = np.asarray(np.isfinite(of_frames).all(axis=(1, 2)))
+    if alone and pose is None and not posed.any():
+        pose = np.eye(4)
     if pose is None and not posed[scan.laser_on].all():
         raise CaptureError(f"{scan.path.name} has no poses of its images: give the pose of each pass (`poses`)")
     stripes = find_stripes(scan, options=stripe)

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.errors import DescriptionError
 from uwlts.model.trajectory import Trajectory
-from uwlts.reconstruction.trajectory_doubts import find_trajectory_doubts
+from uwlts.reconstruction.moving import find_trajectory_doubts
 from uwlts.storage.pose_files import read_trajectory
 
 IMAGES_S = np.linspace(0.5, 39.5, 30)
