@@ -11,6 +11,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,9 @@ class Client:
 
     def __init__(self) -> None:
         import rclpy
+        from geometry_msgs.msg import PoseStamped
         from sensor_msgs.msg import PointCloud2
+        from std_msgs.msg import String
         from std_srvs.srv import Trigger
 
         rclpy.init()
@@ -40,6 +43,11 @@ class Client:
         self._node = rclpy.create_node("test")
         self.messages: list[Any] = []
         self._node.create_subscription(PointCloud2, "points", self.messages.append, 100)
+        self.advice: list[str] = []
+        self._node.create_subscription(String, "next_pass", lambda message: self.advice.append(message.data), 100)
+        pose, publisher = PoseStamped(), self._node.create_publisher(PoseStamped, "pose", 1)
+        pose.pose.orientation.w = 1.0
+        self._node.create_timer(0.1, lambda: publisher.publish(pose))
 
     def call(self, name: str) -> tuple[bool, str]:
         """Call a service of the node, and return success and message."""
@@ -65,13 +73,19 @@ def main() -> None:
     with GrblController(speed_up=20.0, boot_s=0.2, position_mm=30.0) as controller:
         plan_for(folder, controller, images, count=IMAGES)
         words = ["ros", "plan.toml", "--calibration", "calibration.json", "--home", "--frame-id", "tank"]
+        words += ["--pose-std-mm", "0.05", "--pose-std-deg", "0.02"]
         node = subprocess.Popen([sys.executable, "-m", "uwlts", *words], cwd=folder, env=os.environ)
         try:
             client = Client()
+            # The pose counts at the start of a scan.
+            client.spin(partial(lambda since_s: time.monotonic() > since_s + 2.0, time.monotonic()))
             print("start:", client.call("start"))
             print("start again:", client.call("start"))
             client.spin(lambda: len(client.messages) == IMAGES)
             client.spin(lambda: (folder / "test-plate-001.h5").exists())
+            client.spin(lambda: len(client.advice) == 1)
+            print(client.advice[0])
+            assert client.advice[0].startswith("100 mm along Y: +-")
             whole = uwlts.reconstruct(folder / "test-plate-001.h5", folder / "calibration.json")
             tables = [rows(message) for message in client.messages]
             points = np.concatenate([np.stack([table[axis] for axis in "xyz"], 1) for table in tables])

@@ -44,6 +44,8 @@ MEANING = {
         "--plan": "[Pp]lan of (a scan|an acceptance test)|TOML file with sensor, medium, positions",
         "--port": "[Pp]ort of the page",
         "--pose-format": "euler-ZYX-deg",
+        "--pose-std-deg": "Standard uncertaint",
+        "--pose-std-mm": "Standard uncertaint",
         "--pose-unit": "Unit of the .*positions",
         "--poses": "[Pp]ose",
         "--resume": "[Cc]ontinue an (earlier|interrupted)",

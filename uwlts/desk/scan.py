@@ -15,25 +15,29 @@ from array import array
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import replace
+from functools import partial
 from importlib import import_module
 from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from uwlts.calibration.joint.stored_estimate import require_joint
 from uwlts.desk.guided_screen import Ended
 from uwlts.desk.recording_view import LOOK_S, BackgroundView, follow_frames
 from uwlts.desk.shown_state import FrameProfile
-from uwlts.errors import DescriptionError, Error, HardwareError, SetupError
+from uwlts.errors import CalibrationError, DescriptionError, Error, HardwareError, SetupError
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.camera_interface import CameraDevice
 from uwlts.hardware.continuous import ScanListeners
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.scan_plan import ScanPlan, load_plan
 from uwlts.hardware.scanning import ScanProgress, open_camera, record_scan
-from uwlts.model.calibration import AnyCalibration
+from uwlts.model.calibration import AnyCalibration, Calibration, rigid_transform
 from uwlts.optics.fitness import check_fits
+from uwlts.recalibration.recalibrate import recalibrate
 from uwlts.runtime.optional_library import pip_install
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.calibration_file import load_calibration, resolve_calibration
@@ -202,13 +206,44 @@ def open_watch_page(
                 process.wait()
 
 
+class PassAdvice:
+    """The recorded scans as passes over one scene, with the sensor's poses, and the next pass that would help most.
+
+    ``pose`` (4, 4), mm, is that of the sensor now. ``publish`` is called with uncertainties, advice and doubts as text.
+    The standard uncertainties are those of each pose, as for `recalibrate`.
+    """
+
+    def __init__(self, calibration: AnyCalibration, *, pose_std_mm: float | None, pose_std_deg: float | None):
+        if not isinstance(calibration, Calibration):
+            raise CalibrationError("advice on passes needs a joint calibration, not one by polynomials")
+        require_joint(calibration)
+        if not (pose_std_mm and pose_std_deg and pose_std_mm > 0 and pose_std_deg > 0):
+            raise DescriptionError("advice on passes needs `pose_std_mm` and `pose_std_deg`, both positive")
+        self._calibration, self._std_mm, self._std_deg = calibration, pose_std_mm, pose_std_deg
+        self._passes: list[tuple[Path, np.ndarray]] = []
+        self.pose: np.ndarray | None = None
+        self.publish: Callable[[str], None] = lambda text: None
+
+    def add(self, path: Path, pose: np.ndarray | None, progress: ProgressListener) -> None:
+        """Publish the advice after a further pass, recorded with the sensor at ``pose``."""
+        if pose is None:
+            raise HardwareError(f"no pose of the sensor is known for {path.name}, so that no next pass is advised")
+        self._passes.append((path, pose))
+        paths, poses = [each for each, _ in self._passes], np.array([each for _, each in self._passes])
+        std = {"pose_std_mm": self._std_mm, "pose_std_deg": self._std_deg}
+        found = recalibrate(paths, calibration=self._calibration, poses=poses, progress=progress, **std)
+        lengths = [f"100 mm along {each.axis}: +-{each.after_mm:.3f} mm" for each in found.lengths]
+        self.publish("\n".join([*lengths, *found.advice(), *found.doubts]))
+
+
 class ScanService:
     """Scans on request, one at a time, each in a thread of its own: recorded by a plan, or played from a capture.
 
     `start`, `stop` and `laser_off` return at once, with a text for the caller; they raise Error if refused. ``publish``
     is called with the points of each laser image, and the time of the image in s since the start of the scan. A played
     capture may still be recorded by another program; it needs neither camera nor stage. ``home`` homes the stage before
-    a scan for which it is locked, ``unlock`` accepts its position. ``scans`` is the number of scans begun.
+    a scan for which it is locked, ``unlock`` accepts its position. ``advice`` is computed at the end of each recorded
+    scan, as a part of it. ``scans`` is the number of scans begun.
     """
 
     def __init__(
@@ -222,8 +257,10 @@ class ScanService:
         stage: GrblStage | None = None,
         home: bool = False,
         unlock: bool = False,
+        advice: PassAdvice | None = None,
         report: Callable[[str], None] = lambda line: None,
     ):
+        self._advice = advice
         self._source, self._calibration, self._publish, self._report = source, calibration, publish, report
         self._folder, self._camera, self._stage, self._home, self._unlock = folder, camera, stage, home, unlock
         self._stop, self._thread = threading.Event(), threading.Thread()
@@ -288,11 +325,16 @@ class ScanService:
             stage.home()
         elif not stage.position_known and self._unlock:
             stage.unlock()
-        header = plan.header(out.stem)
+        header, pose = plan.header(out.stem), self._advice and self._advice.pose
         with BackgroundView(lambda frame, number: self._show(frame, number, header)) as shown:
             listeners = ScanListeners(report=self._report, between=self._end_if_stopped, recorded=shown.put)
             seen = record_scan(plan, out, camera=camera, stage=stage, listeners=listeners)
-        return "; ".join([f"wrote {out}", *seen.warnings()])
+        written = "; ".join([f"wrote {out}", *seen.warnings()])
+        if self._advice is not None:
+            self._report(written)
+            self._advice.add(out, pose, lambda done, total: self._end_if_stopped())
+            written = "the next pass is advised"
+        return written
 
     def _play(self) -> str:
         """Publish the images of a capture at the speed of the recording, and new ones of a recording when they come."""
@@ -369,6 +411,8 @@ def serve_ros(
     home: bool = False,
     unlock: bool = False,
     frame_id: str = FRAME_ID,
+    pose_std_mm: float | None = None,
+    pose_std_deg: float | None = None,
 ) -> None:
     """Run a node of ROS 2 that records or plays scans and publishes their points; Ctrl-C ends it.
 
@@ -393,6 +437,9 @@ def serve_ros(
         Accept the stage's position without homing.
     frame_id : str
         Frame of the points.
+    pose_std_mm, pose_std_deg : float, optional
+        Standard uncertainties of the sensor's poses, which another program publishes on ``pose``. The node then
+        publishes on ``next_pass`` which further pass over the same scene would help most, as `uwlts.recalibrate`.
 
     Raises
     ------
@@ -401,8 +448,10 @@ def serve_ros(
     DescriptionError, CalibrationError, HardwareError
         The plan or the calibration cannot be read; camera and stage are not named, or cannot be opened.
     """
-    rclpy, executors, sensor, std, builtin, services = _import_ros()
-    known = resolve_calibration(calibration)
+    known, advice = resolve_calibration(calibration), None
+    if pose_std_mm is not None or pose_std_deg is not None:
+        advice = PassAdvice(known, pose_std_mm=pose_std_mm, pose_std_deg=pose_std_deg)
+    rclpy, executors, sensor, std, builtin, services, geometry = _import_ros()
     played = not isinstance(scans, ScanPlan) and Path(scans).suffix in CAPTURES
     source = scans if isinstance(scans, ScanPlan) else Path(scans) if played else load_plan(Path(scans))
     with ExitStack() as stack:
@@ -418,6 +467,10 @@ def serve_ros(
         )
         clouds = StampedClouds(types, lambda: node.get_clock().now().nanoseconds, frame_id=frame_id)
         publisher = node.create_publisher(sensor.PointCloud2, "points", _QUEUED)
+        if advice is not None:
+            advised = node.create_publisher(std.String, "next_pass", _QUEUED)
+            advice.publish = lambda text: advised.publish(std.String(data=text))
+            node.create_subscription(geometry.PoseStamped, "pose", partial(_place, advice), _QUEUED)
         service = ScanService(
             source,
             known,
@@ -427,6 +480,7 @@ def serve_ros(
             stage=moved,
             home=home,
             unlock=unlock,
+            advice=advice,
             report=lambda line: node.get_logger().info(line),
         )
         stack.callback(service.close)
@@ -437,6 +491,14 @@ def serve_ros(
             rclpy.spin(node)
         except executors.ExternalShutdownException as ended:
             raise KeyboardInterrupt from ended  # rclpy turns Ctrl-C into this
+
+
+def _place(advice: PassAdvice, message: Any) -> None:
+    """Take the pose of the sensor from a PoseStamped; one without a rotation is none."""
+    at, turn = message.pose.position, message.pose.orientation
+    quaternion = np.array([turn.x, turn.y, turn.z, turn.w])
+    if quaternion.any():
+        advice.pose = rigid_transform(Rotation.from_quat(quaternion).as_matrix(), 1e3 * np.array([at.x, at.y, at.z]))
 
 
 def _answer(work: Callable[[], str]) -> Callable[[Any, Any], Any]:
@@ -462,6 +524,7 @@ def _import_ros() -> tuple[Any, ...]:
             import_module("std_msgs.msg"),
             import_module("builtin_interfaces.msg"),
             import_module("std_srvs.srv"),
+            import_module("geometry_msgs.msg"),
         )
     except ImportError as error:
         raise SetupError(

@@ -13,18 +13,20 @@ import pytest
 import uwlts
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import MEDIUM, Noise, gathered, target_series
+from tests.uwlts.recalibration.test_recalibration import SENSOR, SHIFTED, WATER, campaign, write_capture
 from tests.waiting import within
 from twin.devices.grbl_controller import GrblController
 from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.desk import scan
-from uwlts.desk.scan import ScanService
-from uwlts.errors import CalibrationError, HardwareError
+from uwlts.desk.scan import PassAdvice, ScanService
+from uwlts.errors import CalibrationError, DescriptionError, HardwareError
 from uwlts.hardware.camera_interface import ReplayCamera
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.scan_plan import ScanPlan, load_plan
 from uwlts.model.calibration import Calibration
 from uwlts.model.sensor import Sensor
+from uwlts.recalibration.as_built import as_built
 from uwlts.storage.capture import CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import PointCloud
@@ -152,6 +154,43 @@ def test_recorded_scans_are_files_and_clouds(tmp_path, lit, calibration, control
     assert times_s[0] < times_s[1] < times_s[2]
 
 
+def test_a_scan_without_a_pose_is_kept_but_gives_no_advice(tmp_path, lit, calibration, controller):
+    said: list[str] = []
+    advice = PassAdvice(calibration, pose_std_mm=0.01, pose_std_deg=0.005)
+    plan = plan_for(tmp_path, controller, lit)
+    with GrblStage(controller.port) as stage, LoopedReplay(lit) as camera:
+        devices = {"camera": camera, "stage": stage, "home": True}
+        service = ScanService(plan, calibration, Mock(), folder=tmp_path, advice=advice, report=said.append, **devices)
+        service.start()
+        service.wait()
+    assert said[-2].startswith(f"wrote {tmp_path / 'test-plate-001.h5'}"), said
+    assert said[-1].startswith("error: no pose of the sensor is known for test-plate-001.h5"), said
+
+
+def test_the_next_pass_is_advised_after_each_one(tmp_path):
+    *_, problem = campaign(9, dict(list(SHIFTED.items())[1:]))
+    advice, told = PassAdvice(as_built(SENSOR, WATER), pose_std_mm=0.01, pose_std_deg=0.005), []
+    advice.publish = told.append
+    for each, (*along, turn) in zip(problem.passes, list(SHIFTED.values())[1:], strict=True):
+        write_capture(tmp_path / f"{each.name}.h5", each)
+        place = SimpleNamespace(x=0.0, y=along[0] / 1000, z=along[1] / 1000)
+        rotation = SimpleNamespace(x=0.0, y=0.0, z=np.sin(np.radians(turn) / 2), w=np.cos(np.radians(turn) / 2))
+        scan._place(advice, SimpleNamespace(pose=SimpleNamespace(position=place, orientation=rotation)))
+        advice.add(tmp_path / f"{each.name}.h5", advice.pose, Mock())
+    stated = [float(line.split("+-")[1].removesuffix(" mm")) for text in told for line in text.splitlines()[:2]]
+    assert max(stated[:2]) > 0.5 and max(stated[2:]) < 0.25, told
+    assert all("next pass: " in text for text in told)
+
+
+@pytest.mark.parametrize(
+    ("stated", "words"),
+    [({"pose_std_mm": 0.1}, "`pose_std_deg`"), ({"pose_std_mm": -0.1, "pose_std_deg": 0.1}, "positive")],
+)
+def test_advice_without_the_uncertainty_of_poses_is_refused_before_anything_opens(capture, calibration, stated, words):
+    with pytest.raises(DescriptionError, match=words):
+        scan.serve_ros(capture, calibration=calibration, **stated)
+
+
 def test_the_laser_off_service_ends_a_scan_with_the_laser_off(tmp_path, lit, calibration, controller):
     said: list[str] = []
     begun = threading.Event()
@@ -199,7 +238,7 @@ def test_a_node_of_ros_that_is_interrupted_ends_as_interrupted(capture: Path, ca
     rclpy = SimpleNamespace(
         init=lambda: done.append("init"), try_shutdown=lambda: done.append("end"), spin=spin, create_node=lambda _: node
     )
-    modules = rclpy, SimpleNamespace(ExternalShutdownException=Ended), Mock(), Mock(), Mock(), Mock()
+    modules = rclpy, SimpleNamespace(ExternalShutdownException=Ended), *(Mock() for _ in range(5))
     monkeypatch.setattr(scan, "_import_ros", lambda: modules)
     with pytest.raises(KeyboardInterrupt):
         scan.serve_ros(capture, calibration=calibration)
