@@ -230,8 +230,14 @@ class PassAdvice:
             raise HardwareError(f"no pose of the sensor is known for {path.name}, so that no next pass is advised")
         self._passes.append((path, pose))
         paths, poses = [each for each, _ in self._passes], np.array([each for _, each in self._passes])
-        std = {"pose_std_mm": self._std_mm, "pose_std_deg": self._std_deg}
-        found = recalibrate(paths, calibration=self._calibration, poses=poses, progress=progress, **std)
+        found = recalibrate(
+            paths,
+            calibration=self._calibration,
+            poses=poses,
+            pose_std_mm=self._std_mm,
+            pose_std_deg=self._std_deg,
+            progress=progress,
+        )
         lengths = [f"100 mm along {each.axis}: +-{each.after_mm:.3f} mm" for each in found.lengths]
         self.publish("\n".join([*lengths, *found.advice(), *found.doubts]))
 
@@ -332,7 +338,7 @@ class ScanService:
         written = "; ".join([f"wrote {out}", *seen.warnings()])
         if self._advice is not None:
             self._report(written)
-            self._advice.add(out, pose, lambda done, total: self._end_if_stopped())
+            self._advice.add(out, pose, lambda *_: self._end_if_stopped())
             written = "the next pass is advised"
         return written
 
