@@ -338,7 +338,7 @@ class ScanService:
         written = "; ".join([f"wrote {out}", *seen.warnings()])
         if self._advice is not None:
             self._report(written)
-            self._advice.add(out, pose, lambda *_: self._end_if_stopped())
+            self._advice.add(out, pose, lambda done, total, stage="": self._end_if_stopped())
             written = "the next pass is advised"
         return written
 
