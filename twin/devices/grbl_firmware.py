@@ -71,6 +71,11 @@ def parse_block(line: str) -> CommandBlock:
             raise GrblError(4)
         else:
             values[letter] = number
+    _refuse_incomplete(commands, values, machine_coordinates)
+    return CommandBlock(commands, values, machine_coordinates)
+
+
+def _refuse_incomplete(commands: dict[str, str], values: dict[str, float], machine_coordinates: bool) -> None:
     once, motion = commands.get("once"), commands.get("motion")
     refused = {
         28: once == "G4" and "P" not in values,
@@ -83,7 +88,6 @@ def parse_block(line: str) -> CommandBlock:
     for code, wrong in refused.items():
         if wrong:
             raise GrblError(code)
-    return CommandBlock(commands, values, machine_coordinates)
 
 
 _DECIMALS = {11, 12, 24, 25, 27, *range(100, 133)}

@@ -24,7 +24,7 @@ from uwlts.evaluation.figures import (
 )
 from uwlts.files.json_files import EDITED, read_model, write_model
 from uwlts.fitting.least_squares import fit_rigid_transform
-from uwlts.model.artefacts import Artefact, parse_artefact, read_artefact
+from uwlts.model.artefacts import Artefact, resolve_artefact
 from uwlts.model.sensor import Table
 from uwlts.model.short_text import Brief
 from uwlts.storage.cloud import PointCloud
@@ -243,12 +243,7 @@ def evaluate(
     if not isinstance(cloud, PointCloud):
         source = source or Path(cloud).name
     cloud = load_cloud(cloud, unit=unit)
-    if artefact is None and (named := cloud.metadata.get("artefact")) is not None:
-        artefact = parse_artefact(named)
-    if isinstance(artefact, str | Path):
-        artefact = read_artefact(artefact)
-    elif isinstance(artefact, dict):
-        artefact = parse_artefact(artefact)
+    artefact = resolve_artefact(cloud.metadata.get("artefact") if artefact is None else artefact)
     if truth is not None and not isinstance(truth, Truth):
         header, read = read_truth(truth)
         if other := _name_other_scene(header, Path(truth), cloud.metadata):

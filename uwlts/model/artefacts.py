@@ -82,3 +82,10 @@ def read_artefact(path: str | Path) -> Artefact:
     not describe an artefact.
     """
     return parse_artefact(read_toml(path, called="artefact"))
+
+
+def resolve_artefact(given: object) -> Artefact | None:
+    """Return the artefact given itself, as a table, or by the path of its description; None stays None."""
+    if isinstance(given, str | Path):
+        return read_artefact(given)
+    return None if given is None else parse_artefact(given)

@@ -15,7 +15,7 @@ from uwlts.calibration.joint.stored_estimate import StoredEstimate, read_stored_
 from uwlts.errors import CalibrationError, CaptureError, DescriptionError, RangeError
 from uwlts.fitting.next_observation import CovarianceRoot, Forecast
 from uwlts.fitting.patches import find_disc_radius
-from uwlts.model.artefacts import Artefact, parse_artefact, read_artefact
+from uwlts.model.artefacts import Artefact, resolve_artefact
 from uwlts.model.calibration import Calibration, KnownMedium, KnownStage, calibration_digest
 from uwlts.model.library import load_sensor
 from uwlts.model.mount import Mount
@@ -307,17 +307,11 @@ def recalibrate(
     problem = _make_problem(gathered, prior, header, mount, pose_std_mm, pose_std_deg)
     start = problem.place(np.zeros(problem.unknowns), [np.zeros(len(each.line)) for each in gathered])
     radius = max(find_disc_radius(start.places_mm[start.number == each]) for each in range(len(gathered)))
-    solution = solve_passes(problem, size_mm=CELL * radius, artefact=_read_artefact(artefact))
+    solution = solve_passes(problem, size_mm=CELL * radius, artefact=resolve_artefact(artefact))
     progress(len(scans) + 1, len(scans) + 1)
     found = summarise(problem, solution, prior, header.stage_direction)
     moved = None if mount is None else move_mount(mount, problem, solution, found.calibration)
     return replace(found, warnings=tuple(warnings), mount=moved)
-
-
-def _read_artefact(given: Artefact | dict[str, object] | str | Path | None) -> Artefact | None:
-    if isinstance(given, str | Path):
-        return read_artefact(given)
-    return parse_artefact(given) if isinstance(given, dict) else given
 
 
 def _read_prior(given: Calibration | str | Path, medium: Medium) -> Calibration:
