@@ -39,20 +39,28 @@ def write_atomically(path: str | os.PathLike[str], *, overwrite: bool = False) -
     aside = target.parent / f".{secrets.token_hex(8)}{target.suffix}"
     _incomplete.add(aside)
     try:
-        # Not tempfile, whose files are private (mode 0600): the finished file would be, too.
-        os.close(os.open(aside, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
-        yield aside
-        _flush(aside, os.O_RDWR)
-        refuse_unsuitable(target, overwrite=overwrite)
-        os.replace(aside, target)
-        # Only POSIX systems can open a folder, to flush the renaming itself.
-        if os.name == "posix":
-            _flush(target.parent, os.O_RDONLY)
-    except OSError as error:
-        raise OutputError(_cannot_write(target, error)) from error
+        with name_write_errors(target):
+            # Not tempfile, whose files are private (mode 0600): the finished file would be, too.
+            os.close(os.open(aside, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+            yield aside
+            _flush(aside, os.O_RDWR)
+            refuse_unsuitable(target, overwrite=overwrite)
+            os.replace(aside, target)
+            # Only POSIX systems can open a folder, to flush the renaming itself.
+            if os.name == "posix":
+                _flush(target.parent, os.O_RDONLY)
     finally:
         aside.unlink(missing_ok=True)
         _incomplete.discard(aside)
+
+
+@contextmanager
+def name_write_errors(target: Path) -> Iterator[None]:
+    """Raise OutputError, which names ``target``, for any OSError of the body."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(_cannot_write(target, error)) from error
 
 
 def remove_incomplete() -> None:

@@ -265,7 +265,7 @@ def read_bag_poses(path: Path, wanted: str = "") -> tuple[np.ndarray, np.ndarray
 
 @contextmanager
 def open_bag(path: Path, *, error: type[Error]) -> Iterator[Any]:
-    """Return a bag as a context; other exceptions than ``error`` are raised as one that calls the file damaged.
+    """Return a bag as a context; exceptions of the library are raised as an ``error`` that calls the file damaged.
 
     Raises SetupError if the library for bags is not installed.
     """
@@ -277,7 +277,7 @@ def open_bag(path: Path, *, error: type[Error]) -> Iterator[Any]:
     try:
         with highlevel.AnyReader([path], default_typestore=typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)) as bag:
             yield bag
-    except error:
+    except Error:
         raise
     except Exception as fault:
         # The library raises errors of file formats, compression, SQLite and the operating system.

@@ -1,5 +1,8 @@
 """Import of images in ROS bags, written by the usual library."""
 
+import errno
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -9,7 +12,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from tests.uwlts.storage.test_import import GIVEN, HEIGHT, SHAPE, WIDTH, lamp_image, stripe_image
-from uwlts.errors import DescriptionError, ImageError
+from uwlts.errors import DescriptionError, ImageError, OutputError
 from uwlts.storage.capture import Capture
 from uwlts.storage.import_.folder import import_images
 
@@ -128,3 +131,15 @@ def test_damaged_bags_and_bags_without_a_description_are_refused(tmp_path):
         imported(damaged, BY_TOPIC)
     with pytest.raises(DescriptionError, match="no description"):
         import_images(damaged, tmp_path / "out.h5")
+
+
+def test_a_full_disk_is_not_called_a_damaged_bag(tmp_path, monkeypatch):
+    bag = write_bag(tmp_path / "bag", {"/laser": (STRIPES, "mono8")})
+
+    def fail(path, content):
+        raise OSError(errno.ENOSPC, "x")
+
+    monkeypatch.setattr(Path, "write_bytes", fail)
+    with pytest.raises(OutputError, match="out.h5: the disk is full"):
+        imported(bag, BY_TOPIC)
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["bag", "given.toml"]

@@ -1,7 +1,7 @@
 """Images in ROS recordings as a folder: a subfolder for each topic, and a table with the times of the images."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 
 from uwlts.errors import ImageError
-from uwlts.storage.image_file import read_header
+from uwlts.files.writing import name_write_errors
+from uwlts.storage.image_file import SUFFIXES, read_header
 from uwlts.storage.import_.folder_description import ImportDescription
 from uwlts.storage.import_.matching import matches
 from uwlts.storage.ros_messages import list_topics, open_bag, read_messages
@@ -29,8 +30,8 @@ def is_bag(path: Path) -> bool:
 
 
 @contextmanager
-def unpack_images(bag: Path, given: ImportDescription, beside: Path) -> Iterator[tuple[Path, ImportDescription]]:
-    """Write the images of a bag into a temporary folder in ``beside``; return it with the completed description.
+def unpack_images(bag: Path, given: ImportDescription, out: Path) -> Iterator[tuple[Path, ImportDescription]]:
+    """Write the images of a bag into a temporary folder beside ``out``; return it with the completed description.
 
     An image is TOPIC/NUMBER.png, or .jpg if it is compressed; topics without a described light are left out. The
     description gets the table of times and the Bayer pattern if it states none.
@@ -39,19 +40,23 @@ def unpack_images(bag: Path, given: ImportDescription, beside: Path) -> Iterator
     ------
     ImageError
         The bag is damaged, the description names no images in it, or an image has another encoding.
+    OutputError
+        The folder of ``out`` is not writable, or the disk is full.
     SetupError
         The library for bags is not installed.
     """
-    with TemporaryDirectory(dir=beside, prefix=".uwlts-") as made:
-        folder, rows, pattern = Path(made), ["file,time_s"], given.bayer
+    rows, pattern = ["file,time_s"], given.bayer
+    wanted = given.laser, given.lamp, given.background
+    with ExitStack() as stack:
+        with name_write_errors(out):
+            folder = Path(stack.enter_context(TemporaryDirectory(dir=out.parent, prefix=".uwlts-")))
         with open_bag(bag, error=ImageError) as opened:
-            wanted = [*map(given.__getattribute__, ("laser", "lamp", "background"))]
             topics = {each.topic for each in opened.connections if each.msgtype in (_RAW, _COMPRESSED)}
             used = {
                 topic
                 for topic in topics
                 if given.table is not None
-                or any(matches(_name(topic, 1, kind), some) for some in wanted for kind in (".png", ".jpg"))
+                or any(matches(_name(topic, 1, ending), some) for some in wanted for ending in SUFFIXES)
             }
             if not used:
                 raise ImageError(
@@ -63,15 +68,16 @@ def unpack_images(bag: Path, given: ImportDescription, beside: Path) -> Iterator
                 counts[connection.topic] += 1
                 place = f"{bag}, {connection.topic}, image {counts[connection.topic]}"
                 ending, content = _encode(message, connection.msgtype, place)
-                name = _name(connection.topic, counts[connection.topic], ending)
-                (folder / name).parent.mkdir(parents=True, exist_ok=True)
-                (folder / name).write_bytes(content)
-                stamp = message.header.stamp
+                name, stamp = _name(connection.topic, counts[connection.topic], ending), message.header.stamp
+                with name_write_errors(out):
+                    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                    (folder / name).write_bytes(content)
                 rows.append(f"{name},{stamp.sec}.{stamp.nanosec:09d}")
                 if getattr(message, "encoding", "").startswith("bayer_"):
                     pattern = pattern or message.encoding[6:10].upper()
         table = folder / "times.csv"
-        table.write_text("\n".join(rows) + "\n", encoding="utf-8")
+        with name_write_errors(out):
+            table.write_text("\n".join(rows) + "\n", encoding="utf-8")
         more = {"table": str(table)} if given.table is None else {}
         yield folder, given.model_copy(update={"bayer": pattern, **more})
 

@@ -207,7 +207,7 @@ def import_images(
     given, name = read_description(path), folder.resolve().name
     if not bag:
         return _import_folder(folder, name, out, given, path, overwrite, progress)
-    with unpack_images(folder, given, out.parent) as (unpacked, completed):
+    with unpack_images(folder, given, out) as (unpacked, completed):
         return _import_folder(unpacked, name, out, completed, path, overwrite, progress)
 
 
