@@ -89,9 +89,14 @@ class Forecast(Generic[AnyCandidate]):
         """Reduction of the figure."""
         return self.before - self.after
 
+    @property
+    def helpful(self) -> bool:
+        """True if the candidate reduces the figure enough to be advised."""
+        return self.after <= _HELPFUL * self.before
+
     def advice(self, lengths: str) -> str:
         """Describe the candidate as advice for the uncertainty of ``lengths``, mm, without a full stop."""
-        if self.after > _HELPFUL * self.before:
+        if not self.helpful:
             return f"no single further image would reduce the uncertainty of {lengths} by a twentieth"
         return (
             f"{self.candidate.words} would reduce the standard uncertainty of {lengths} from {self.before:.4f} to "

@@ -244,7 +244,7 @@ def move_calibration(known: StoredEstimate, values: np.ndarray) -> Calibration:
             "camera": parameters.camera(values),
             "window": parameters.window_model(values),
             "sheet": sheet,
-            "camera_from_object": tuple(map(tuple, frame.tolist())),
+            "camera_from_object": _rows(frame),
         }
     )
 
@@ -392,13 +392,13 @@ def move_mount(mount: Mount, problem: PassProblem, solution: PassSolution, calib
     inverse = np.linalg.pinv(of_parameters / np.outer(std, std), rcond=_NEGLIGIBLE, hermitian=True)
     by_parameters = shared[:6] @ (inverse / np.outer(std, std))
     apart = of_mount[:6, :6] - by_parameters @ shared[:6].T
-    changes = {
-        "T_platform_sensor": transform,
-        "covariance": 0.5 * (of_mount + of_mount.T)[:6, :6],
+    changes: dict[str, object] = {
+        "T_platform_sensor": _rows(transform),
+        "covariance": _rows(0.5 * (of_mount + of_mount.T)[:6, :6]),
         "sensor": SensorShare(
             calibration=calibration_digest(calibration),
-            by_parameters=tuple(map(tuple, by_parameters.tolist())),
-            covariance_apart=tuple(map(tuple, (0.5 * (apart + apart.T)).tolist())),
+            by_parameters=_rows(by_parameters),
+            covariance_apart=_rows(0.5 * (apart + apart.T)),
         ),
     }
     change = by @ components
@@ -409,7 +409,9 @@ def move_mount(mount: Mount, problem: PassProblem, solution: PassSolution, calib
         scale = problem.motion.pose_scale
         changes["robot_scale"] = mount.robot_scale * (1.0 + scale * float(solution.amplitudes[count]))
         changes["robot_scale_std"] = scale * float(np.sqrt(solution.covariance[count, count]))
-    for name in ("T_platform_sensor", "covariance"):
-        changes[name] = tuple(map(tuple, np.asarray(changes[name]).tolist()))
     before, after = np.linalg.norm(by, axis=1), np.sqrt(np.einsum("iu,uv,iv->i", by, covariance, by))
     return MovedMount(mount.model_copy(update=changes), change, before, after)
+
+
+def _rows(matrix: np.ndarray) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, matrix.tolist()))

@@ -195,7 +195,7 @@ class Recalibrated(Brief):
 
     def advice(self) -> list[str]:
         """Return the most helpful further pass, and the most helpful single motion, as text."""
-        if not self.next_passes or self.next_passes[0].after > 0.95 * self.next_passes[0].before:
+        if not (self.next_passes and self.next_passes[0].helpful):
             return ["no single further pass would reduce the uncertainty of these lengths by a twentieth"]
         return [
             f"next pass: {each.candidate.words}: 100 mm then to {each.after:.3f} mm instead of {each.before:.3f} mm"
@@ -276,6 +276,7 @@ def recalibrate(
     for name, std in (("pose_std_mm", pose_std_mm), ("pose_std_deg", pose_std_deg)):
         if not std > 0:
             raise RangeError(f"`{name}` is {std:g}; expected a positive number")
+    artefact = resolve_artefact(artefact)
     given = (
         read_poses(Path(poses), pose_format=pose_format, unit=pose_unit)[0] if isinstance(poses, str | Path) else poses
     )
@@ -307,7 +308,7 @@ def recalibrate(
     problem = _make_problem(gathered, prior, header, mount, pose_std_mm, pose_std_deg)
     start = problem.place(np.zeros(problem.unknowns), [np.zeros(len(each.line)) for each in gathered])
     radius = max(find_disc_radius(start.places_mm[start.number == each]) for each in range(len(gathered)))
-    solution = solve_passes(problem, size_mm=CELL * radius, artefact=resolve_artefact(artefact))
+    solution = solve_passes(problem, size_mm=CELL * radius, artefact=artefact)
     progress(len(scans) + 1, len(scans) + 1)
     found = summarise(problem, solution, prior, header.stage_direction)
     moved = None if mount is None else move_mount(mount, problem, solution, found.calibration)

@@ -15,10 +15,10 @@ from tests.uwlts.recalibration.test_recalibration import (
     NOISE_PX,
     SENSOR,
     WATER,
+    check_derivatives,
     coordinates_of,
     draw_sensor,
     draw_surface,
-    replace_points,
 )
 from uwlts.calibration.joint.stored_estimate import read_stored_estimate
 from uwlts.model.calibration import rigid_transform
@@ -115,15 +115,7 @@ def campaign(seed):
 
 def test_derivatives_are_those_of_the_points():
     _, problem = campaign(1)
-    some = replace(problem, passes=[replace_points(each, slice(None, None, 400)) for each in problem.passes])
-    start = 0.3 * np.random.default_rng(2).normal(size=some.unknowns)
-    none = [np.zeros(len(each.line)) for each in some.passes]
-    placed = some.place(start, none)
-    for column in range(some.unknowns):
-        step = 1e-3 * np.eye(some.unknowns)[column]
-        moved = (some.place(start + step, none).places_mm - some.place(start - step, none).places_mm) / 2e-3
-        scale = 1e-4 + np.abs(moved).max()
-        assert np.abs(placed.by_unknowns[:, :, column] - moved).max() < 0.02 * scale, column
+    check_derivatives(problem)
 
 
 def solve(seed):
