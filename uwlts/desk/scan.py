@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from uwlts.calibration.joint.stored_estimate import require_joint
 from uwlts.desk.guided_screen import Ended
 from uwlts.desk.recording_view import LOOK_S, BackgroundView, follow_frames
 from uwlts.desk.shown_state import FrameProfile
@@ -36,6 +37,7 @@ from uwlts.hardware.scan_plan import ScanPlan, load_plan
 from uwlts.hardware.scanning import ScanProgress, open_camera, record_scan
 from uwlts.model.calibration import AnyCalibration, Calibration, rigid_transform
 from uwlts.optics.fitness import check_fits
+from uwlts.recalibration.recalibrate import recalibrate
 from uwlts.runtime.optional_library import pip_install
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.calibration_file import load_calibration, resolve_calibration
@@ -214,8 +216,6 @@ class PassAdvice:
     def __init__(self, calibration: AnyCalibration, *, pose_std_mm: float | None, pose_std_deg: float | None):
         if not isinstance(calibration, Calibration):
             raise CalibrationError("advice on passes needs a joint calibration, not one by polynomials")
-        from uwlts.calibration.joint.stored_estimate import require_joint
-
         require_joint(calibration)
         if not (pose_std_mm and pose_std_deg and pose_std_mm > 0 and pose_std_deg > 0):
             raise DescriptionError("advice on passes needs `pose_std_mm` and `pose_std_deg`, both positive")
@@ -229,8 +229,6 @@ class PassAdvice:
         if pose is None:
             raise HardwareError(f"no pose of the sensor is known for {path.name}, so that no next pass is advised")
         self._passes.append((path, pose))
-        from uwlts.recalibration.recalibrate import recalibrate  # only now: it would double the start of a scan
-
         paths, poses = [each for each, _ in self._passes], np.array([each for _, each in self._passes])
         found = recalibrate(
             paths,
