@@ -176,11 +176,12 @@ def gauss_legendre(low: float, high: float, count: int) -> tuple[np.ndarray, np.
 
 
 def seen_at(sensor: Sensor, medium: Medium, points: np.ndarray) -> np.ndarray:
-    """Image points (N, 2) of points (N, 3) of the OCS by least time and OpenCV's lens."""
+    """Image points (N, 2) of points (N, 3) of the OCS by least time, straight without window, and OpenCV's lens."""
     camera, d = sensor.camera, sensor.camera.distortion
     fx, (cx, cy) = camera.focal_length_px(), camera.principal_point()
     matrix = np.array([[fx, 0, cx], [0, camera.pixel_aspect * fx, cy], [0, 0, 1.0]])
-    rays = oracle_paths(sensor, medium, points)[0]
+    axes, standoff = camera_axes(sensor)
+    rays = oracle_paths(sensor, medium, points)[0] if camera.window.mounted else points @ axes.T + standoff
     return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, np.array(list(d.model_dump().values())))[0][:, 0]
 
 

@@ -276,8 +276,10 @@ def project_points(renderer: Renderer, scene_from_object: np.ndarray, points_mm:
         at = pixels[:, None] + [(0, 0), (1, 0), (0, 1)]
         bundle = renderer.view.trace_bundle(to_jit(at[..., 0]), to_jit(at[..., 1]))
         dr.eval(bundle.origin, bundle.direction)
+        # Without a window all rays have one origin.
         origin, direction = (
-            to_numpy(v).astype(float).reshape(at.shape[:2] + (3,)) for v in (bundle.origin, bundle.direction)
+            np.broadcast_to(to_numpy(v).astype(float).reshape(-1, 3), (at[..., 0].size, 3)).reshape(*at.shape[:2], 3)
+            for v in (bundle.origin, bundle.direction)
         )
         towards = points[:, None] - origin
         miss = towards - np.sum(towards * direction, axis=2, keepdims=True) * direction

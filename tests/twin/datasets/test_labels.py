@@ -188,11 +188,12 @@ def test_masks_follow_from_light_and_noise(thesis):
     assert ((mask & Mask.HAZE) > 0).sum() == 4 and ((mask & Mask.SECONDARY) > 0).sum() == 1
 
 
-def test_target_points_are_labelled(thesis):
+@pytest.mark.parametrize(("name", "medium"), [("target-through-window", "water"), ("target", "air")])
+def test_target_points_are_labelled(thesis, name: str, medium: str):
     from tests.virtual_sensors import seen_at
     from twin.scene.description import load_scene
 
-    scene = load_scene("target-through-window", medium="water", motion=Motion(lights=("lamp",), direction=(0, 0, 1)))
+    scene = load_scene(name, medium=medium, motion=Motion(lights=("lamp",), direction=(0, 0, 1)))
     studio = SensorSimulator(small(thesis), scene, Options(spp=4, effects=SINGLE))
     lamp = Shot(stage_mm=10.0, travelled_mm=10.0, light="lamp")
     found = make_labels(studio, lamp, studio.expose(lamp, 0), ("target",))["target_px"]
