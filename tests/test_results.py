@@ -184,7 +184,7 @@ def test_a_study_writes_its_table_with_date_commit_command_and_code(project, mon
     block = f"<!-- results: a table; code {study.digest()} -->\n\n{line}\n\n| mm |\n| --- |\n| 0.074 |\n\n<!-- end -->"
     assert (project / "page.md").read_text().startswith(f"# Page\n\n{block}\n\n<!-- results: another -->")
     assert MEASURED.search(block)
-    with pytest.raises(SystemExit, match="lists no table 'another' by `python study.py`"):
+    with pytest.raises(SystemExit, match="has no table 'another' by `python study.py`"):
         result_tables.publish({"another": table}, write=True)
     monkeypatch.setattr(sys, "argv", [str(project / "study.py"), "--first", "3", "--write"])
     with pytest.raises(SystemExit, match="run without --write"):

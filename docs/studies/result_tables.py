@@ -36,7 +36,7 @@ CODE = ("uwlts", "twin", "scenes", "tests", "docs/studies")
 """Folders whose uncommitted changes could change a figure."""
 BLOCK = re.compile(r"<!-- results: ([^;\n]+?)(?:; code ([0-9a-f]{12}))? -->\n\n(.*?)\n\n<!-- end -->", re.DOTALL)
 MEASURED = re.compile(r"^\*Measured (\S+) at commit `(\w+)`(?: with changes)?: `([^`]+)`\.\*$", re.MULTILINE)
-PROSE = re.compile(r'^ *(?:r?"""(?:[^"]|"(?!""))*"""|#.*)\n', re.MULTILINE)
+PROSE = re.compile(rb'^ *(?:r?"""(?:[^"]|"(?!""))*"""|#.*)\n', re.MULTILINE)
 """Docstrings and comments. The digest is one of the code alone."""
 
 
@@ -69,9 +69,7 @@ class Study:
 
     def run(self) -> None:
         """Run the commands; a folder of runs/results that they name is emptied if it is by other code."""
-        for word in shlex.split(self.command):
-            if not word.startswith(FOLDERS):
-                continue
+        for word in [word for word in shlex.split(self.command) if word.startswith(FOLDERS)]:
             folder = ROOT.joinpath(*Path(word).parts[:3])
             mark = folder / "code"
             if not mark.exists() or mark.read_text() != self.digest():
@@ -91,8 +89,8 @@ def _digest(folder: str) -> str:
     if not path.exists():
         raise SystemExit(f"error: {LIST.name} names the code {folder}, which does not exist")
     for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
-        if file.suffix in (".py", ".toml"):
-            total.update(f"{file.relative_to(ROOT)}\n{PROSE.sub('', file.read_text(encoding='utf-8'))}".encode())
+        if file.is_file() and file.suffix != ".pyc":
+            total.update(str(file.relative_to(ROOT)).encode() + b"\n" + PROSE.sub(b"", file.read_bytes()))
     return total.hexdigest()
 
 
@@ -146,9 +144,7 @@ def publish(tables: dict[str, str], *, write: bool) -> None:
         if not write:
             print(f"{name}\n\n{describe_measurement()}\n\n{text}", flush=True)
         elif study is None or name not in study.tables:
-            raise SystemExit(
-                f"error: {LIST.name} lists no table '{name}' by `{running_command()}`; run without --write"
-            )
+            raise SystemExit(f"error: {LIST.name} has no table '{name}' by `{running_command()}`; run without --write")
         else:
             _replace(name, f"; code {study.digest()}", f"{describe_measurement()}\n\n{text}")
 
