@@ -20,17 +20,18 @@ export PIP_NO_INPUT := 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-full oldest check style types fuzz soak bench docs setup clean
+.PHONY: help demo test test-full oldest check style types fuzz soak bench results docs setup clean
 
 help:
 	@echo "make demo    scan with the simulated sensor and show the result"
 	@echo "make test    check the style and run the tests, without the slow ones"
 	@echo "make test-full   make check, and all tests, slow studies of statistics and campaigns included"
 	@echo "make oldest  run documented commands with the oldest allowed libraries, in $(OLDEST) (make test-full does it too)"
-	@echo "make check   only check the code: format, lint, layers of imports, idioms, types, licences of the libraries, size"
+	@echo "make check   only check the code: format, lint, layers of imports, idioms, types, licences, size; lists old results"
 	@echo "make fuzz    read many damaged files; CASES=5000 of each kind, READERS=\"capture sensor\" only these"
 	@echo "make soak    record 100,000 images by the desk and watch its memory; IMAGES=1000 only so many"
 	@echo "make bench   measure speed"
+	@echo "make results   measure the tables of docs/results again (days); STALE=1 only those whose code has changed"
 	@echo "make docs    build the documentation site in docs/_build/html"
 	@echo "make setup   only prepare .venv and libLLVM (the targets above do it too)"
 	@echo "make clean   remove .venv, $(OLDEST), caches and build results"
@@ -68,6 +69,7 @@ oldest: setup $(OLDEST)/.installed
 
 check: style types
 	@$(PYTHON) -m pytest -q tests/test_licences.py tests/test_budget.py
+	@$(PYTHON) -m docs.studies.result_tables
 
 style: setup
 	@$(PYTHON) -m ruff format --check --quiet .
@@ -88,6 +90,11 @@ soak: setup
 
 bench: setup
 	@$(PYTHON) -m tests.bench
+
+# The cheapest studies run first. When it was stopped, it continues with the study that was stopped.
+results: setup
+	@$(WITH_ARAVIS)
+	@$(PYTHON) -m docs.studies.result_tables --run $(if $(STALE),--stale)
 
 docs: setup
 	@$(PYTHON) -m pip install --quiet --editable '.[docs]'

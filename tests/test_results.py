@@ -1,4 +1,4 @@
-"""Pages of results: every table states its measurement, and other pages quote figures as they were measured."""
+"""Pages of results: every table is written by one command, and other pages quote figures as they were measured."""
 
 import re
 import subprocess
@@ -15,42 +15,45 @@ from tests.documented import PAGES, PROGRAMS, README, ROOT, name_of
 
 FOLDER = ROOT / "docs" / "results"
 RESULTS = [page for page in PAGES if page.parent == FOLDER and page.name not in ("index.md", "limits.md")]
-"""The index contains no figures, and the limits quote those of other pages."""
+"""The index and the limits quote figures of these."""
 QUOTING = [page for page in PAGES if page not in RESULTS]
 MEASURED = re.compile(
     r"^\*(?:Measured (?P<day>\d{4}-\d\d-\d\d) at commit `(?P<run>[0-9a-f]{7,40})`(?: with changes)?"
-    r"|Recorded (?:\d{4}-\d\d-\d\d to )?(?P<last>\d{4}-\d\d-\d\d) in commit `(?P<page>[0-9a-f]{7,40})`)"
+    r"|Recorded (?P<last>\d{4}-\d\d-\d\d) in commit `(?P<page>[0-9a-f]{7,40})`)"
     r": (?P<commands>.+)\.\*$",
     re.MULTILINE,
 )
-NO_COMMAND = "no command was kept"
 FIGURE = re.compile(r"(?<![\w.])(\d[\d,]*(?:\.\d+)?) ?(mm|µm|px|%|deg|°|ms|s|K|times|frames/s)(?!\w)")
 NUMBER = re.compile(r"(?<![\w.])(\d[\d,]*(?:\.\d+)?)( µm)?")
 
 
-def _sections(text: str) -> list[str]:
-    return re.split(r"^(?=#+ )", text, flags=re.MULTILINE)
-
-
 @pytest.mark.parametrize("page", RESULTS, ids=name_of)
-def test_tables_and_sections_with_figures_state_their_measurement(page):
-    for section in _sections(page.read_text(encoding="utf-8")):
-        first = re.search(r"^\|", section, re.MULTILINE)
-        if first or (section.startswith("## ") and FIGURE.search(section)):
-            line = MEASURED.search(section)
-            assert line, f"{name_of(page)}: no date, commit and command under '{section.splitlines()[0]}'"
-            assert first is None or line.start() < first.start(), f"{name_of(page)}: a table before its measurement"
-
-
-@pytest.mark.parametrize("page", RESULTS, ids=name_of)
-def test_lines_on_measurements_have_one_form_and_name_commands(page):
+def test_all_tables_are_marked_and_begin_with_their_measurement(page):
     text = page.read_text(encoding="utf-8")
-    lines = list(MEASURED.finditer(text))
-    assert len(lines) == len(re.findall(r"^\*(?:Measured|Recorded)", text, re.MULTILINE)) > 0
-    for line in lines:
+    blocks = list(result_tables.BLOCK.finditer(text))
+    assert blocks and text.count("<!-- ") == 2 * len(blocks)
+    assert not re.search(r"^(?:\||\*Measured|\*Recorded)", result_tables.BLOCK.sub("", text), re.MULTILINE)
+    for block in blocks:
+        line = MEASURED.match(block[3])
+        assert line, f"{name_of(page)}: no date, commit and command of '{block[1]}'"
+        assert re.fullmatch(r"\n\n(?:\|.*\|\n?)+", block[3][line.end() :])
         commands = re.findall(r"`([^`]+)`", line["commands"])
-        assert line["commands"] == (", ".join(f"`{command}`" for command in commands) or NO_COMMAND)
+        assert line["commands"] == ", ".join(f"`{command}`" for command in commands) and commands
         assert all(command.split()[0] in PROGRAMS for command in commands)
+
+
+def test_each_table_has_one_study_and_each_study_its_code():
+    studies = result_tables.read_studies()
+    names = sorted(name for study in studies for name in study.tables)
+    assert names == sorted(set(result_tables.read_blocks()) - {"pages"})
+    assert len({study.command for study in studies}) == len(studies) > 40
+    assert len({study.digest() for study in studies}) > 20  # A folder that does not exist ends the program.
+
+
+def test_the_results_are_short():
+    """Pages of tables with a few sentences: 12,000 words beside the bars of the tables are the most."""
+    words = [word for page in PAGES if page.parent == FOLDER for word in page.read_text(encoding="utf-8").split()]
+    assert sum(word not in ("|", "---") for word in words) <= 12_000
 
 
 @cache
@@ -72,19 +75,6 @@ def test_named_commits_are_in_the_history(page):
         days = [day for commit, day in _commits().items() if commit.startswith(line["run"] or line["page"])]
         assert len(days) == 1, f"{name_of(page)}: no commit of {line[0]}"
         assert days[0] == line["last"] if line["page"] else days[0] <= line["day"], f"{name_of(page)}: {line[0]}"
-
-
-@pytest.mark.parametrize("page", RESULTS, ids=name_of)
-def test_a_study_writes_each_marked_table(page):
-    studies = [*(ROOT / "docs" / "studies").glob("*.py"), *(ROOT / "tests" / "bench").glob("*.py")]
-    sources = "\n".join(path.read_text(encoding="utf-8") for path in studies)
-    text = page.read_text(encoding="utf-8")
-    names = re.findall(r"<!-- results: (.+) -->\n\n(?=\*)", text)
-    assert text.count("<!-- results: ") == text.count("<!-- end -->") == len(names)
-    for name in names:
-        # A study may put together the name of a table from a group and a key.
-        parts = (name, *re.split(r"(?<=, )|(?<=by a )", name)) if name not in sources else (name,)
-        assert name in sources or all(part in sources for part in parts[1:]), f"{name_of(page)}: no study of '{name}'"
 
 
 def _quotes(page: Path) -> Iterator[tuple[Path, str]]:
@@ -148,20 +138,101 @@ def test_an_older_figure_is_noticed():
     assert _differing("a mean error of 0.08 mm", results) == ["0.08"]
 
 
-def test_a_study_writes_its_table_with_date_commit_and_command(tmp_path, monkeypatch):
-    page = tmp_path / "page.md"
-    page.write_text("before\n\n<!-- results: a table -->\n\nolder\n\n<!-- end -->\n\nafter\n", encoding="utf-8")
-    monkeypatch.setattr(result_tables, "PAGES", tmp_path)
+STUDY = """
+[code]
+all = ["code"]
+[[study]]
+command = "python study.py"
+minutes = 2
+tables = ["a table"]
+code = ["all"]
+[[study]]
+command = "python other.py runs/results/kept"
+minutes = 1
+tables = ["another"]
+code = ["code/one.py"]
+"""
+CODE = '"""Module."""\n\n\ndef one():\n    """Return 1."""\n    # Reason.\n    return 1\n'
+
+
+@pytest.fixture
+def project(tmp_path, monkeypatch):
+    """Return a project with two studies, a page with their tables, and an index."""
+    (tmp_path / "code").mkdir()
+    (tmp_path / "code" / "one.py").write_text(CODE)
+    for name, text in {"study.py": "", "other.py": "", "results.toml": STUDY}.items():
+        (tmp_path / name).write_text(text)
+    marks = "".join(f"<!-- results: {name} -->\n\nolder\n\n<!-- end -->\n\n" for name in ("a table", "another"))
+    (tmp_path / "page.md").write_text(f"# Page\n\n{marks}after\n")
+    (tmp_path / "index.md").write_text("# Index\n\n<!-- results: pages -->\n\n-\n\n<!-- end -->\n")
+    for name, value in {"ROOT": tmp_path, "PAGES": tmp_path, "LIST": tmp_path / "results.toml"}.items():
+        monkeypatch.setattr(result_tables, name, value)
     # The commit is this one, so that the test also runs without a repository.
     monkeypatch.setattr(result_tables, "_git", lambda *words: "0123abc" if words[0] == "rev-parse" else " M uwlts/x.py")
-    monkeypatch.setattr(sys, "argv", [str(ROOT / "docs/studies/mount_calibration.py"), "60", "--write"])
     monkeypatch.setattr(sys.modules["__main__"], "__spec__", None)
-    result_tables.publish({"a table": result_tables.table(["mm"], [["0.074"]])}, write=True)
-    today = date.today().isoformat()
-    line = f"*Measured {today} at commit `0123abc` with changes: `python docs/studies/mount_calibration.py 60`.*"
-    table = "| mm |\n| --- |\n| 0.074 |"
-    block = f"<!-- results: a table -->\n\n{line}\n\n{table}\n\n<!-- end -->"
-    assert page.read_text(encoding="utf-8") == f"before\n\n{block}\n\nafter\n"
+    result_tables._digest.cache_clear()
+    yield tmp_path
+    result_tables._digest.cache_clear()
+
+
+def test_a_study_writes_its_table_with_date_commit_command_and_code(project, monkeypatch):
+    monkeypatch.setattr(sys, "argv", [str(project / "study.py"), "--write"])
+    table = result_tables.table(["mm"], [["0.074"]])
+    result_tables.publish({"a table": table}, write=True)
+    study = result_tables.read_studies()[1]
+    line = f"*Measured {date.today().isoformat()} at commit `0123abc` with changes: `python study.py`.*"
+    block = f"<!-- results: a table; code {study.digest()} -->\n\n{line}\n\n| mm |\n| --- |\n| 0.074 |\n\n<!-- end -->"
+    assert (project / "page.md").read_text().startswith(f"# Page\n\n{block}\n\n<!-- results: another -->")
     assert MEASURED.search(block)
-    with pytest.raises(SystemExit, match="0 places for the table 'another'"):
+    with pytest.raises(SystemExit, match="has no table 'another' by `python study.py`"):
         result_tables.publish({"another": table}, write=True)
+    monkeypatch.setattr(sys, "argv", [str(project / "study.py"), "--first", "3", "--write"])
+    with pytest.raises(SystemExit, match="run without --write"):
+        result_tables.publish({"a table": table}, write=True)
+
+
+def test_only_changed_code_makes_a_table_old(project, monkeypatch, capsys):
+    path, before = project / "code" / "one.py", [study.digest() for study in result_tables.read_studies()]
+
+    def digests(text: str) -> list[str]:
+        path.write_text(text)
+        result_tables._digest.cache_clear()
+        return [study.digest() for study in result_tables.read_studies()]
+
+    assert digests(CODE.replace("Return 1", "Return one").replace("# Reason", "# Another reason")) == before
+    assert all(new != old for new, old in zip(digests(CODE.replace("return 1", "return 2")), before, strict=True))
+    (project / "study.py").write_text("import numpy\n")
+    assert digests(CODE)[0] == before[0] and digests(CODE)[1] != before[1]
+
+
+def test_studies_run_in_order_of_cost_and_continue(project, monkeypatch, capsys):
+    ran, broken = [], []
+
+    def run(command, **how):
+        ran.append(command[1])
+        if command[1] not in broken:
+            monkeypatch.setattr(sys, "argv", [str(project / command[1]), *command[2:]])
+            name = "a table" if command[1] == "study.py" else "another"
+            result_tables.publish({name: result_tables.table(["mm"], [["1"]])}, write=True)
+
+    monkeypatch.setattr(result_tables.subprocess, "run", run)
+    broken.append("study.py")
+    assert result_tables.main(run=True, stale=True) == 1
+    assert ran == ["other.py", "study.py"] and "not written: a table" in capsys.readouterr().out
+    (project / "runs/results/kept/rendered").touch()
+    broken.clear()
+    assert result_tables.main(run=True, stale=True) == 0 and ran[2:] == ["study.py"]
+    assert "[1 of 1, 2 min left] python study.py (2 min)" in capsys.readouterr().out
+    assert "| [Page](page.md) | 2 | 2 |\n| all | 2 | 2 |" in (project / "index.md").read_text()
+    # By other code, only the study of the file is old; what it kept is removed.
+    (project / "code" / "two.py").touch()
+    (project / "code" / "one.py").write_text("one = 2\n")
+    result_tables._digest.cache_clear()
+    result_tables.main()
+    assert "0 of 2 tables are of today's code" in capsys.readouterr().out
+    assert result_tables.main(run=True, stale=True) == 0 and ran[3:] == ["other.py", "study.py"]
+    assert not (project / "runs/results/kept/rendered").exists()
+    # All: those of this commit are not measured again.
+    assert result_tables.main(run=True) == 0 and len(ran) == 5
+    monkeypatch.setattr(result_tables, "_git", lambda *words: "fedcba9" if words[0] == "rev-parse" else "")
+    assert result_tables.main(run=True) == 0 and len(ran) == 7

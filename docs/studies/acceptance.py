@@ -64,12 +64,6 @@ def characteristics_table(found: Acceptance) -> str:
     return table([*heads, "probability of conformity", "decision"], rows)
 
 
-def requirements_table(found: Acceptance) -> str:
-    """Return the table of requirements."""
-    rows = [[each.clause, each.required, each.done, "yes" if each.met else "no"] for each in found.requirements]
-    return table(["clause", "required", "done", "met"], rows)
-
-
 def flyers_table(folder: Path) -> str:
     """Return PF, F and the decisions on them after moving a share of the points of all spheres and planes."""
     plan = load_plan(PLAN).model_dump(mode="json", exclude_none=True)
@@ -116,9 +110,7 @@ def main(folder: Path, *, write: Annotated[bool, Parameter(negative="")] = False
     found = uwlts.accept(folder / PLAN.name)
     uwlts.report.write_acceptance(folder / "acceptance.html", found, overwrite=True)
     print("\n".join(found.lines()))
-    tables = {"acceptance": characteristics_table(found), "acceptance requirements": requirements_table(found)}
-    tables["acceptance flyers"] = flyers_table(folder)
-    publish(tables, write=write)
+    publish({"acceptance": characteristics_table(found), "acceptance flyers": flyers_table(folder)}, write=write)
 
 
 if __name__ == "__main__":

@@ -13,10 +13,10 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-from cyclopts import App, Parameter
+from cyclopts import App
+from result_tables import publish, table
 
 import uwlts
 from uwlts.hardware import continuous as recorder
@@ -37,23 +37,22 @@ settling_s = 0.05
 """
 
 
-def spheres(cloud, stops: np.ndarray | None = None) -> tuple[str, np.ndarray]:
-    """Return the figures of a cloud of spheres as text, with shifts along X from ``stops``, and its centres (2, 3)."""
+def spheres(cloud, stops: np.ndarray | None = None) -> tuple[list[str], np.ndarray]:
+    """Return spacing error, scatter and shift along the stage from ``stops`` as cells, and the centres (2, 3)."""
     result = uwlts.evaluate(cloud)
     centres = np.array([sphere["centre_mm"] for sphere in result.evaluation.spheres])
-    text = f"spacing {1e3 * result.sphere_spacing.value_mm:+6.1f} um, std {1e3 * result.std.value_mm:5.1f} um"
-    if stops is not None:
-        text += f", centres {1e3 * float((centres - stops)[:, 0].mean()):+6.1f} um along the stage"
-    return f"{text}, {len(cloud)} points", centres
+    shift = "-" if stops is None else f"{1e3 * float((centres - stops)[:, 0].mean()):+.1f} µm"
+    return [f"{1e3 * value.value_mm:.1f} µm" for value in (result.sphere_spacing, result.std)] + [shift], centres
 
 
-def main(*options: Annotated[str, Parameter(allow_leading_hyphen=True)]) -> None:
-    """Scan with options of `twin serve`, and print a line for each."""
+def main(*, write: bool = False) -> None:
+    """Scan and print the table; with `--write`, put it into its page."""
+    rows = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "fast.toml").write_text(SENSOR)
         command = [sys.executable, "-m", "twin", "serve", "spheres", "--sensor", str(folder / "fast.toml")]
-        command += ["--water", "clear", *options]
+        command += ["--water", "clear"]
         served = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
         try:
             said = ""
@@ -85,8 +84,8 @@ def main(*options: Annotated[str, Parameter(allow_leading_hyphen=True)]) -> None
                 return path
 
             uwlts.scan(plan(), folder / "stops.h5", home=True)
-            text, stops = spheres(uwlts.reconstruct(folder / "stops.h5", calibration))
-            print(f"stop and go:      {text}", flush=True)
+            cells, stops = spheres(uwlts.reconstruct(folder / "stops.h5", calibration))
+            rows.append(["stops", "-", "-", *cells])
             usual = recorder._compare_clocks
             for speed in SPEEDS_MM_S:
                 for shift in SHIFTS_S:
@@ -96,11 +95,15 @@ def main(*options: Annotated[str, Parameter(allow_leading_hyphen=True)]) -> None
                     uwlts.scan(
                         plan(continuous=moving), folder / "moving.h5", report=said_by.append, home=True, overwrite=True
                     )
-                    print(f"{speed:5.0f} mm/s, {1e3 * shift:+.0f} ms:", said_by[-1], flush=True)
-                    print(f"    {spheres(uwlts.reconstruct(folder / 'moving.h5', calibration), stops)[0]}", flush=True)
+                    latency = re.search(r"latency of the stage (\S+) ms", said_by[-1])[1]
+                    cells, _ = spheres(uwlts.reconstruct(folder / "moving.h5", calibration), stops)
+                    rows.append([f"{speed:.0f} mm/s", f"{1e3 * shift:.0f} ms", f"{float(latency):+.2f} ms", *cells])
+                    print(*rows[-1], flush=True)
         finally:
             served.terminate()
             served.communicate()
+    head = ["speed", "added", "latency measured", "spacing error", "std about the spheres"]
+    publish({"continuous scans": table([*head, "centres along the stage, against the stops"], rows)}, write=write)
 
 
 if __name__ == "__main__":

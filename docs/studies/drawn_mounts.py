@@ -1,18 +1,15 @@
 """Mounts from sets drawn by `tests/oracles/profilers.py`, beside plain least squares of the same points.
 
-    python docs/studies/drawn_mounts.py 400 406 --artefact sphere
-    python docs/studies/drawn_mounts.py 400 406 --artefact sphere --size-known --short-arcs --halves --fixed-mm 0.03
-
-Arguments are the first seed and the one after the last.
+python docs/studies/drawn_mounts.py [--first 500] [--write]
 """
 
-import argparse
 import sys
-import time
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from cyclopts import App
+from result_tables import publish, table
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
@@ -21,60 +18,62 @@ from tests.uwlts.drawn_mounts import SHORT_ARCS, differences, least_squares_moun
 from uwlts.errors import CalibrationError
 
 
-def measure(
-    seed: int, kind: Kind, *, size_known: bool, short_arcs: bool, halves: bool, fixed_mm: float
-) -> list[float] | None:
-    """Print a row of one set, and return its figures; None if it was refused."""
-    given = draw_set([seed, 7], kind, fixed_mm=fixed_mm, **(SHORT_ARCS if short_arcs else {}))
-    begun = time.process_time()
+class Case(NamedTuple):
+    """Kind of the sets: number, artefact, and options of the draw and of the calibration."""
+
+    name: str
+    count: int
+    artefact: Kind = "sphere"
+    size_known: bool = False
+    short_arcs: bool = False
+    fixed_mm: float = 0.0
+
+
+CASES = (
+    Case("sphere", 8),
+    Case("plane with two ridges", 12, "plane"),
+    Case("sphere of known size, arcs of 60 deg", 12, size_known=True, short_arcs=True),
+    Case("the same, form error of 0.03 mm", 6, size_known=True, short_arcs=True, fixed_mm=0.03),
+)
+
+
+def measure(seed: int, case: Case) -> list[float] | None:
+    """Return the figures of one set, None if it was refused.
+
+    They are the scatter relative to the least, that of the true values, errors of the shift by the mount and by least
+    squares, and the fraction of coordinates within their intervals.
+    """
+    given = draw_set([seed, 7], case.artefact, fixed_mm=case.fixed_mm, **(SHORT_ARCS if case.short_arcs else {}))
     try:
-        mount = mount_of(given, size_known=size_known)
+        mount = mount_of(given, size_known=case.size_known)
     except CalibrationError as error:
-        print(f"{seed}: {time.process_time() - begun:.1f} s, {error}", flush=True)
+        print(f"{case.name}, {seed}: {error}", file=sys.stderr, flush=True)
         return None
-    spent = time.process_time() - begun
-    plain, least = least_squares_mount(given, size_known=size_known)
+    plain, least = least_squares_mount(given, size_known=case.size_known)
     error, other = (differences(each, given.mount) for each in (mount.transform(), plain))
     true = scatter_mm(given, given.mount, given.artefact[:3, 3], given.artefact[:3, 2], given.size_mm)
-    row = [
+    return [
         rms_mm(given, mount) / least,
         float(np.sqrt(np.mean(true**2))) / least,
         float(np.linalg.norm(error[:3])),
         float(np.linalg.norm(other[:3])),
-        float(np.linalg.norm(mount.std()[:3])),
         float(np.mean(np.abs(error) < mount.coverage_factor * mount.std())),
-        sum(pose.reason is not None for pose in mount.poses),
-        len(mount.poses),
-        spent,
-        np.nan,
     ]
-    if halves:
-        one, two = (mount_of(given.select(slice(k, None, 2)), size_known=size_known) for k in (0, 1))
-        apart, spread = differences(one.transform(), two.transform()), np.add(one.covariance, two.covariance)
-        row[-1] = float(chi2.sf(apart @ np.linalg.solve(spread, apart), 6))
-    print(f"{seed}:", " ".join(f"{value:.3g}" for value in row), flush=True)
-    return row
+
+
+def main(*, first: int = 500, write: bool = False) -> None:
+    """Print the table; with `--write`, put it into its page."""
+    rows = []
+    for case in CASES:
+        found = [row for seed in range(first, first + case.count) if (row := measure(seed, case)) is not None]
+        scatter, true, error, other, within = np.transpose(found)
+        sizes = (f"{np.median(each):.3f} / {each.max():.3f}" for each in (scatter, true))
+        errors = (f"{np.sqrt(np.mean(each**2)):.2f}" for each in (error, other))
+        rows.append([case.name, f"{len(found)} of {case.count}", *sizes, *errors, f"{100 * within.mean():.0f} %"])
+    head = ["artefact", "sets", "scatter relative to the least, median / largest", "that of the true values"]
+    head += ["error of shift, rms mm", "by least squares", "within 95 % intervals"]
+    publish({"mounts of drawn sets": table(head, rows)}, write=write)
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("first", type=int)
-    parser.add_argument("last", type=int)
-    parser.add_argument("--fixed-mm", type=float, default=0.0, help="form error that is the same in all profiles")
-    parser.add_argument("--artefact", choices=["sphere", "plane"], default="sphere")
-    for flag in ("--size-known", "--short-arcs", "--halves"):
-        parser.add_argument(flag, action="store_true")
-    own = vars(parser.parse_args())
-    seeds, artefact = range(own.pop("first"), own.pop("last")), own.pop("artefact")
-    print(
-        "seed: scatter / least, that of the true values, error mm, that of least squares, stated, within 95 %, left "
-        "out, poses, s, p of halves"
-    )
-    rows = np.array([row for seed in seeds if (row := measure(seed, artefact, **own)) is not None])
-    print(
-        f"{len(rows)} of {len(seeds)} sets: scatter relative to least squares {np.median(rows[:, 0]):.3f} (median), "
-        f"{rows[:, 0].max():.3f} (largest), of the true values {np.median(rows[:, 1]):.3f} and {rows[:, 1].max():.3f}; "
-        f"error {np.sqrt(np.mean(rows[:, 2] ** 2)):.3f} mm (rms), least squares "
-        f"{np.sqrt(np.mean(rows[:, 3] ** 2)):.3f} mm; within 95 % intervals {100 * rows[:, 5].mean():.1f} %; "
-        f"{rows[:, 6].sum():.0f} of {rows[:, 7].sum():.0f} poses left out; at most {rows[:, 8].max():.1f} s"
-    )
+    App(help=__doc__, help_format="plaintext", default_command=main)()

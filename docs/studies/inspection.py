@@ -1,13 +1,9 @@
-"""Errors of inspections of rendered scans; `docs/studies/prediction.py` has the probability of detection.
+"""Errors of inspections and meshes of rendered scans; `docs/studies/prediction.py` has the probability of detection.
 
-    python docs/studies/inspection_scenes.py runs/inspection      # and render, as it says
-    cd runs/inspection/calibration && uwlts calibrate --air target-bare.h5 target-air.h5 --water target-water.h5 \
-        --step step-near-water.h5 step-standoff-water.h5 step-far-water.h5 --out calibration.json
-    python docs/studies/inspection.py runs/inspection docs/pictures
-    python docs/studies/inspection.py runs/inspection-5 5         # pits and welds of another draw
+    python docs/studies/inspection.py FOLDER [--write]
 
-Prints the tables of the documentation: errors and coverage of all values against the closed form, and false claims of
-change.
+Renders the scenes of `inspection_scenes.py` by two draws of sensor, noise, pits and welds, calibrates jointly, and
+compares with the closed form: values of inspections, false claims of change, and meshes.
 """
 
 from dataclasses import replace
@@ -16,8 +12,20 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 from cyclopts import App
-from inspection_scenes import AXIS_Z_MM, DIAMETER_MM, OVALITY, SIDES_DEG, WATERS, Pits, large_pits, small_pits
-from result_tables import table
+from inspection_scenes import (
+    AXIS_Z_MM,
+    DIAMETER_MM,
+    OVALITY,
+    SIDES_DEG,
+    WATERS,
+    Pits,
+    cloud_of,
+    large_pits,
+    record,
+    small_pits,
+)
+from rendered_mesh import mesh_table
+from result_tables import publish, table
 from scipy.spatial.transform import Rotation
 
 import uwlts
@@ -30,15 +38,22 @@ from uwlts.storage.capture_writer import CaptureWriter
 HOLLOWS = FeatureKind.PIT, FeatureKind.DENT
 BLEMISHES = *HOLLOWS, FeatureKind.PROTRUSION
 HEAD = ["of", "value", "number", "bias", "spread", "stated std", "truth within the 95 % interval"]
-
-
-def cloud_of(folder: Path, water: str, name: str) -> uwlts.PointCloud:
-    """Return the cloud of a recording, reconstructed once."""
-    path = folder / water / f"{name}.cloud.h5"
-    if not path.exists():
-        cloud = uwlts.reconstruct(folder / water / f"{name}.h5", folder / "calibration" / "calibration.json")
-        cloud.save(path)
-    return uwlts.read(path)
+DRAWS = 0, 5
+SHOWN = (
+    "depth",
+    "length",
+    "lost area",
+    "diameter",
+    "ovality",
+    "height",
+    "width",
+    "largest undercut",
+    "flatness",
+    "position",
+)
+"""Values in the table."""
+PICTURE = Path(__file__).parents[1] / "pictures" / "inspection-pits.png"
+Pairs = list[tuple[Feature, dict[str, float]]]
 
 
 def around(folder: Path, water: str) -> uwlts.PointCloud:
@@ -99,25 +114,18 @@ def true_values(diameter: float, depth: float, edge: float) -> dict[str, float]:
     }
 
 
-def figure_rows(name: str, pairs: list[tuple[Feature, dict[str, float]]]) -> list[list[str]]:
+def figure_rows(name: str, pairs: Pairs) -> list[list[str]]:
     """Rows of a table of errors: value, number, bias, spread, mean standard uncertainty, coverage."""
     rows = []
-    for value in pairs[0][1] if pairs else ():
-        known = [(feature[value], truth[value]) for feature, truth in pairs if value in feature]
+    for value in SHOWN:
+        known = [(feature[value], truth[value]) for feature, truth in pairs if value in feature and value in truth]
+        if not known:
+            continue
         error = np.array([each.value - truth for each, truth in known])
-        inside = np.mean([each.low <= truth <= each.high for each, truth in known])
+        inside = sum(each.low <= truth <= each.high for each, truth in known)
         stated = np.mean([each.uncertainty for each, _ in known])
-        rows.append(
-            [
-                name,
-                value,
-                f"{len(known)}",
-                f"{error.mean():+.4f}",
-                f"{error.std():.4f}",
-                f"{stated:.4f}",
-                f"{100 * inside:.0f} %",
-            ]
-        )
+        sizes = f"{error.mean():+.4f}", f"{error.std():.4f}", f"{stated:.4f}"
+        rows.append([name, value, f"{len(known)}", *sizes, f"{inside} of {len(known)}"])
     return rows
 
 
@@ -145,7 +153,7 @@ def true_weld(weld: Weld) -> dict[str, float]:
     return sizes | {"toe angle left": left, "toe angle right": right, "misalignment": 0.0}
 
 
-def pit_pairs(found: list[Feature | None], pits: Pits, chosen: np.ndarray) -> list[tuple[Feature, dict[str, float]]]:
+def pit_pairs(found: list[Feature | None], pits: Pits, chosen: np.ndarray) -> Pairs:
     """Return features and true values of the found pits among those chosen, (P,) bool."""
     return [
         (each, true_values(diameter, depth, each["edge depth"].value))
@@ -154,105 +162,74 @@ def pit_pairs(found: list[Feature | None], pits: Pits, chosen: np.ndarray) -> li
     ]
 
 
-def small_pits_in(folder: Path, water: str, draw: int = 0) -> list[list[str]]:
-    """Rows of the figures of small pits, for each diameter."""
-    pits, inspected = small_pits(draw), uwlts.inspect_pipe(cloud_of(folder, water, "pipe-after"))
-    found = matched(inspected, pits)
+def pits_in(folder: Path, water: str, draw: int) -> dict[str, Pairs]:
+    """Return found and true values of small and large pits by their diameters; false indications are printed."""
+    small, large = small_pits(draw), large_pits(draw)
+    inspected = uwlts.inspect_pipe(cloud_of(folder, water, "pipe-after"))
+    corroded = uwlts.inspect_pipe(cloud_of(folder, water, "pipe-corroded"), wall_mm=9.5)
     plain = uwlts.inspect_pipe(cloud_of(folder, water, "pipe-before"))
-    false = false_ones(inspected, pits), len(plain.select(*BLEMISHES))
-    print(f"{water}: indications that are no pit: {false[0]} with pits, {false[1]} without; {inspected.notes[-1]}")
-    figures = []
-    for diameter in np.unique(pits.diameter):
-        deep = pit_pairs(found, pits, (pits.diameter == diameter) & (pits.depth > 0.1))
-        figures += figure_rows(f"{water}, {diameter:g} mm, 0.1 to 0.4 mm deep", deep)
-    return figures
+    false = false_ones(inspected, small), false_ones(corroded, large), len(plain.select(*BLEMISHES))
+    print(f"{water}, {draw}: indications that are no pit: small, large, none: {false}; {inspected.notes[-1]}")
+    found = matched(inspected, small)
+    pairs = {
+        f"pits, {diameter:g} mm wide, 0.1 to 0.4 mm deep": pit_pairs(
+            found, small, (small.diameter == diameter) & (small.depth > 0.1)
+        )
+        for diameter in np.unique(small.diameter)
+    }
+    chosen = pit_pairs(matched(corroded, large), large, large.diameter >= 10)
+    return pairs | {"pits, 10 to 24 mm wide, 0.4 to 5 mm deep": chosen}
 
 
-def large_pits_in(folder: Path, water: str, draw: int = 0) -> list[list[str]]:
-    """Rows of the figures of large pits; each is printed."""
-    pits, inspected = large_pits(draw), uwlts.inspect_pipe(cloud_of(folder, water, "pipe-corroded"), wall_mm=9.5)
-    found = matched(inspected, pits)
-    print(f"{water}: large pits found: {sum(each is not None for each in found)}, false: {false_ones(inspected, pits)}")
-    for k, each in enumerate(found):
-        if each is not None:
-            print(f"  {pits.diameter[k]:g} mm, {pits.depth[k]:g} mm deep: {each['depth'].text()}")
-    return figure_rows(f"{water}, 10 to 24 mm, 0.5 to 5 mm deep", pit_pairs(found, pits, pits.diameter >= 10))
-
-
-def wholes_in(folder: Path, water: str) -> list[list[str]]:
-    """Rows of the figures of the pipe from six sides and of the weld."""
+def wholes_in(folder: Path, water: str) -> dict[str, Pairs]:
+    """Return found and true values of the pipe from six sides, of welds, and of the flange with its holes."""
     pipe = uwlts.inspect_pipe(around(folder, water))
-    truth = {"diameter": DIAMETER_MM, "ovality": DIAMETER_MM * OVALITY, "ovality share": 100 * OVALITY}
-    rows = figure_rows(f"{water}, pipe", [(pipe.features[0], truth | {"straightness": 0.0})])
-    sections = pipe.select(FeatureKind.SECTION)
-    rows += figure_rows(f"{water}, sections", [(each, {"ovality": truth["ovality"]}) for each in sections])
-    print(f"{water}: blemishes on the smooth pipe from six sides: {len(pipe.select(*BLEMISHES))}")
-    return rows + welds_in(folder, water)
-
-
-def welds_in(folder: Path, water: str) -> list[list[str]]:
-    """Rows of the figures of welds."""
-    pairs = []
+    truth = {"diameter": DIAMETER_MM, "ovality": DIAMETER_MM * OVALITY}
+    pairs: dict[str, Pairs] = {"pipe from six sides": [(pipe.features[0], truth)], "welds": []}
     for path in sorted(folder.glob(f"weld*-{water}.toml")):
         weld = load_scene(str(path)).objects[0]
         assert isinstance(weld, Weld)
         found = uwlts.inspect_weld(cloud_of(folder, water, path.stem.removesuffix(f"-{water}")))
-        pairs.append((found.features[0], true_weld(weld)))
-    return figure_rows(f"{water}, weld", pairs)
-
-
-def unchanged_in(folder: Path, water: str, draw: int = 0) -> None:
-    """Print false claims of change, outside the pits."""
-    before = cloud_of(folder, water, "pipe-before")
-    for name, pits in (("pipe-after", small_pits(draw)), ("pipe-corroded", large_pits(draw))):
-        change = uwlts.compare_clouds(cloud_of(folder, water, name), before, same_water=True)
-        reach = pits.diameter / 2 + change.disc_mm / 2
-        clear = change.compared & np.all(distances(pits, change.points_mm) > reach, axis=1)
-        share = 100 * float(change.significant[clear].mean())
-        scatter, level = np.sqrt(np.mean(change.distance_mm[clear] ** 2)), np.median(change.level_mm[clear])
-        print(f"{water}, {name}: change is claimed on {share:.2f} % of {clear.sum()} places where nothing changed")
-        print(f"  rms distance there {scatter:.4f} mm, level {level:.4f} mm")
-
-
-def flanges_in(folder: Path, water: str) -> list[list[str]]:
-    """Rows of the figures of a flange and its holes."""
+        pairs["welds"].append((found.features[0], true_weld(weld)))
     scene = load_scene(str(folder / f"flange-{water}.toml")).objects[0]
     assert isinstance(scene, Flange)
     found = uwlts.inspect_flange(cloud_of(folder, "flanges", f"flange-{water}"))
     truth = {"flatness": scene.flatness_mm, "bore": scene.bore_diameter_mm, "bolt circle": scene.bolt_circle_mm}
     holes = [(hole, {"diameter": scene.hole_diameter_mm, "position": 0.0}) for hole in found.select(FeatureKind.HOLE)]
-    rows = figure_rows(f"{water}, flange", [(found.features[0], truth)])
-    return rows + figure_rows(f"{water}, holes of the flange", holes)
+    return pairs | {"flange": [(found.features[0], truth)], "holes of the flange": holes}
 
 
-def draw_again(folder: Path, draw: int) -> None:
-    """Print the figures of the pits and welds of another draw."""
-    rows = []
-    for water in WATERS:
-        rows += small_pits_in(folder, water, draw) + large_pits_in(folder, water, draw) + welds_in(folder, water)
-        unchanged_in(folder, water, draw)
-    print(table(HEAD, rows))
+def unchanged_rows(folder: Path, water: str, draw: int) -> list[list[str]]:
+    """Return rows of false claims of change, outside the pits."""
+    before, rows = cloud_of(folder, water, "pipe-before"), []
+    for name, pits in (("pipe-after", small_pits(draw)), ("pipe-corroded", large_pits(draw))):
+        change = uwlts.compare_clouds(cloud_of(folder, water, name), before, same_water=True)
+        reach = pits.diameter / 2 + change.disc_mm / 2
+        clear = change.compared & np.all(distances(pits, change.points_mm) > reach, axis=1)
+        share = f"{100 * float(change.significant[clear].mean()):.1f} %"
+        sizes = np.sqrt(np.mean(change.distance_mm[clear] ** 2)), np.median(change.level_mm[clear])
+        pit = "small" if name == "pipe-after" else "large"
+        rows.append([f"{draw}", water, pit, f"{clear.sum():,}", share, *(f"{size:.4f}" for size in sizes)])
+    return rows
 
 
-def main(folder: Path, pictures: str) -> None:
-    """Print all tables and draw the pictures into a folder; with the number of another draw, only print its tables."""
-    if pictures.isdecimal():
-        draw_again(folder, int(pictures))
-    else:
-        print_and_draw(folder, Path(pictures))
-
-
-def print_and_draw(folder: Path, pictures: Path) -> None:
-    """Print all tables and draw the picture."""
-    figures = []
-    for water in WATERS:
-        figures += small_pits_in(folder, water) + large_pits_in(folder, water)
-        unchanged_in(folder, water)
-        print(table(HEAD, wholes_in(folder, water)))
-    print(table(HEAD, figures))
-    draw_map(folder, pictures / "inspection-pits.png")
-    for water in WATERS:
-        print(table(HEAD, flanges_in(folder, water)))
+def main(folder: Path, *, write: bool = False) -> None:
+    """Render and print the tables; with `--write`, put them into their pages, and draw the picture."""
+    pairs: dict[str, Pairs] = {}
+    changes = []
+    for draw in DRAWS:
+        own = folder / str(draw)
+        record(own, draw)
+        for water in WATERS:
+            for name, some in (pits_in(own, water, draw) | wholes_in(own, water)).items():
+                pairs.setdefault(name, []).extend(some)
+            changes += unchanged_rows(own, water, draw)
+    head = ["draw", "water", "pits", "places", "claimed", "rms distance, mm", "level, mm"]
+    tables = {"inspected values": table(HEAD, [row for name, some in pairs.items() for row in figure_rows(name, some)])}
+    tables |= {"changes of rendered pipes": table(head, changes), "meshes": mesh_table(folder / str(DRAWS[0]))}
+    publish(tables, write=write)
+    if write:
+        draw_map(folder / str(DRAWS[0]), PICTURE)
 
 
 def draw_map(folder: Path, path: Path) -> None:

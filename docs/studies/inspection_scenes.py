@@ -1,15 +1,8 @@
-"""Objects of known shape for the study of inspections, as meshes and scenes, and the campaign that renders them.
+"""Objects of known shape for the study of inspections, as meshes and scenes, and the campaigns that render them.
 
-    python docs/studies/inspection_scenes.py runs/inspection      # meshes, scenes and campaigns
-    twin record runs/inspection/calibration.toml --out runs/inspection/calibration
-    twin record runs/inspection/clear.toml --out runs/inspection/clear
-    twin record runs/inspection/coastal.toml --out runs/inspection/coastal
-    twin record runs/inspection/flanges.toml --out runs/inspection/flanges
-
-The objects are a pipe of 300 mm diameter and 0.5 % ovality, welds, and a thin plate seen from both sides. The pipe is
-smooth, has a grid of small pits for the probability of detection, or has large pits; one is seen from six sides. All
-surfaces are known in closed form (`radius_mm`). A number after the folder draws other pits and welds, for
-`twin record --seed` of the same number.
+The objects are a pipe of 300 mm diameter and 0.5 % ovality, welds, a flange, and a thin plate seen from both sides. The
+pipe is smooth, has a grid of small pits, or has large pits; one is seen from six sides. All surfaces are known in
+closed form (`radius_mm`).
 """
 
 from dataclasses import dataclass
@@ -19,7 +12,10 @@ from typing import Any
 import numpy as np
 import tomli_w
 import trimesh
-from cyclopts import App
+from thin_wall import write_plate
+
+import twin
+import uwlts
 
 DIAMETER_MM, OVALITY, AXIS_Z_MM = 300.0, 0.005, 150.0
 OVAL_AT = np.radians(20.0)
@@ -141,8 +137,8 @@ def scenes(folder: Path, draw: int = 0) -> dict[str, dict[str, Any]]:
     return found
 
 
-def main(folder: Path, draw: int = 0) -> None:
-    """Write meshes, scenes and campaigns."""
+def record(folder: Path, draw: int) -> None:
+    """Write meshes, scenes and campaigns, render them, and calibrate; what is there is used."""
     folder.mkdir(parents=True, exist_ok=True)
     names = scenes(folder, draw)
     for water in WATERS:
@@ -175,7 +171,21 @@ def main(folder: Path, draw: int = 0) -> None:
     ]
     campaign = {"base": "thesis", "title": "inspection, calibration", "recordings": calibration}
     (folder / "calibration.toml").write_text(tomli_w.dumps(campaign), encoding="utf-8")
+    write_plate(folder)
+    for name in ("calibration", *WATERS, "flanges", "plate"):
+        twin.record(folder / f"{name}.toml", out=folder / name, seed=draw)
+    if not (path := folder / "calibration" / "calibration.json").exists():
+        views = {name: [folder / "calibration" / f"target-{name}.h5"] for name in ("bare", "air", "water")}
+        steps = [folder / "calibration" / f"step-{place}-water.h5" for place in ("near", "standoff", "far")]
+        uwlts.calibrate(air=views["bare"] + views["air"], water=views["water"], step=steps).save(path)
 
 
-if __name__ == "__main__":
-    App(help=__doc__, help_format="plaintext", default_command=main)()
+def cloud_of(folder: Path, water: str, name: str) -> uwlts.PointCloud:
+    """Return the cloud of a recording, reconstructed once."""
+    path = folder / water / f"{name}.cloud.h5"
+    if not path.exists():
+        cloud = uwlts.reconstruct(folder / water / f"{name}.h5", folder / "calibration" / "calibration.json")
+        cloud.save(path)
+    cloud = uwlts.read(path)
+    assert isinstance(cloud, uwlts.PointCloud)
+    return cloud

@@ -152,64 +152,31 @@ def places() -> dict[str, Place]:
     }
 
 
-def sweeps() -> dict[str, Place]:
-    """Return cases that each change one parameter on the plane."""
-    turned = {
-        f"turned {angle:+.0f}\N{DEGREE SIGN} about {'XY'[axis]}, {name}": Place(
-            z_mm=PLACES[name], spp=8, turned_deg=(angle, 0.0) if axis == 0 else (0.0, angle)
-        )
-        for axis in (0, 1)
-        for name in (("near", "far") if axis == 0 else ("stand-off",))
-        for angle in (-30.0, 30.0)
-    }
-    optics = {
-        f"waist {waist:g} mm, f/{number:g}, {name}": Place(
-            z_mm=PLACES[name], spp=8, laser=(("waist_radius_mm", waist),), camera=(("f_number", number),)
-        )
-        for waist in (0.15, 0.6)
-        for number in (2.8, 11.0)
-        for name in ("near", "far")
-    }
-    water = {
-        f"turbidity {turbidity:g}, stand-off": Place(water=turbidity, spp=8 if turbidity < 2 else 32)
-        for turbidity in (0.0, 1.0, 2.0, 3.0)
-    }
-    return turned | optics | water
-
-
 LEVELS = (0.1, 0.3, 1.0, 2.0, 4.0, 8.0)
 """Exposures divided by the automatic one, which sets the brightest light to 0.8 of the full well."""
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Bias (mean), standard deviation of single lines and of means of five lines, px; std in mm; fraction found.
+    """Bias (mean) and standard deviation of single lines, px; std in mm; fraction found.
 
-    Errors above 2 px, at limbs and edges, are left out and counted in ``far_off``.
+    Errors above 2 px, at limbs and edges, are left out.
     """
 
     bias_px: float
     std_px: float
-    five_px: float
     std_mm: float
     found: float
-    far_off: float
 
     @classmethod
     def of(cls, error_px: np.ndarray, mm_per_px: np.ndarray, used: np.ndarray) -> "Spread":
         """Calculate from errors (F, L), NaN on lines without a centre."""
-        near = np.abs(error_px) <= 2.0
-        error = np.where(near, error_px, np.nan)
-        count = error.shape[1] // 5 * 5
-        five = error[:, :count].reshape(len(error), -1, 5).mean(axis=2)
-        seen = np.isfinite(error_px)
+        error = np.where(np.abs(error_px) <= 2.0, error_px, np.nan)
         return cls(
             float(np.nanmean(error)),
             float(np.nanstd(error)),
-            float(np.nanstd(five)),
             float(np.nanstd(error * mm_per_px)),
-            float(seen[:, used].mean()),
-            float((seen & ~near).sum() / seen.sum()),
+            float(np.isfinite(error_px)[:, used].mean()),
         )
 
 

@@ -1,9 +1,8 @@
-"""Rotary table, pipe from five sides and vehicle: figures of the rendered scenes against their truth.
+"""Rotary table and pipe from five sides: figures of the rendered scenes against their truth.
 
     python docs/studies/moving_recordings.py FOLDER rotary-sphere rotary-target --sensors 1 2 3 4 5 --seeds 0 1
     python docs/studies/moving_recordings.py FOLDER robot-sphere --sensors 1 2 3 4 5 --seeds 0 1
     python docs/studies/moving_recordings.py FOLDER pipe-five-sides --sensors 1 2 3 4 5 --seeds 0 1 --denser 4
-    twin simulate vehicle-pipe --sensor thesis-small --out FOLDER/vehicle.h5
     python docs/studies/moving_scenes.py FOLDER
 
 The mount for a pipe is that of the robot's capture with the same seed and sensor. The pipe's poses have the same
@@ -14,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from cyclopts import App
+from result_tables import publish, table
 from robot_campaigns import FOR_THE_MOUNT, RADIUS_MM
 from scipy.optimize import least_squares
 
@@ -47,8 +47,8 @@ def captured(path: Path) -> CapturedProfiles:
         return reconstruct_profiles(capture, calibration, None, None)
 
 
-def rotary(path: Path) -> str:
-    """Error of a table's axis from a sphere or target on it, and its standard uncertainty."""
+def rotary(path: Path) -> tuple[float, float, float, float]:
+    """Error of a table's axis from a sphere or target on it and what is stated: angle in deg, position in mm."""
     motion, truth = truth_of(path)
     if path.name.startswith("rotary-sphere"):
         mount = uwlts.calibrate_mount(captured(path), radius_mm=RADIUS_MM, axis="-y")
@@ -59,11 +59,8 @@ def rotary(path: Path) -> str:
     off = axis[:3, 3] - found[:3, 3]
     off -= off @ axis[:3, 2] * axis[:3, 2]
     turn, std = np.arccos(min(1.0, float(axis[:3, 2] @ found[:3, 2]))), mount.std()
-    return (
-        f"{path.parent.name}, {path.stem}: "
-        f"axis off by {np.degrees(turn):.3f} deg ({np.degrees(np.linalg.norm(std[3:5])):.3f} stated) and "
-        f"{np.linalg.norm(off):.3f} mm ({np.linalg.norm(std[:2]):.3f} stated)"
-    )
+    stated = float(np.degrees(np.linalg.norm(std[3:5]))), float(np.linalg.norm(std[:2]))
+    return float(np.degrees(turn)), stated[0], float(np.linalg.norm(off)), stated[1]
 
 
 def pipe(path: Path, calibration: Calibration, mount: Mount) -> np.ndarray:
@@ -114,58 +111,33 @@ def form(points: np.ndarray, view: np.ndarray) -> Form:
     return 2 * float(found[4]) - PIPE_MM, ovality - OVALITY_MM, float(np.abs(steps).max())
 
 
-def vehicle(path: Path) -> str:
-    """Return the point errors, as text, with the reported path, and with the true path and mount."""
-    motion, truth = truth_of(path)
-    reported = uwlts.read(str(path).replace(".h5", ".trajectory.csv"))
-    with uwlts.read(path) as capture:
-        times, stated = capture.time_s[:] + motion.clock_offset_s, np.trace(capture.pose_covariance[-1, :3, :3])
-    cloud = uwlts.reconstruct(
-        path, uwlts.nominal("thesis-small", medium="water"), trajectory=reported, clock_offset_s=motion.clock_offset_s
-    )
-    expected = truth.point_mm[cloud.frame, cloud.line]
-    carried = reported.poses_at(times)[cloud.frame] @ motion.mount.matrix()
-    seen = np.einsum("nji,nj->ni", carried[:, :3, :3], cloud.points_mm - carried[:, :3, 3])
-    true = truth.pose[cloud.frame]
-    again = np.einsum("nij,nj->ni", true[:, :3, :3], seen) + true[:, :3, 3]
-    off = [np.nanmedian(np.linalg.norm(points - expected, axis=1)) for points in (cloud.points_mm, again)]
-    platform = truth.pose @ np.linalg.inv(motion.true_mount.matrix())
-    end = np.linalg.norm(reported.poses_at(times)[-1, :3, 3] - platform[-1, :3, 3])
-    way = np.linalg.norm(np.diff(platform[:, :3, 3], axis=0), axis=1).sum()
-    return (
-        f"vehicle: {len(times)} images over {way / 1e3:.1f} m, at the end off by {end:.0f} mm ({np.sqrt(stated):.0f} "
-        f"stated); points off by {off[0]:.1f} mm (median), with the true path and mount {off[1]:.3f} mm"
-    )
-
-
-def main(folder: Path) -> None:
-    """Print all figures."""
+def main(folder: Path, *, write: bool = False) -> None:
+    """Print the tables; with `--write`, put them into their page."""
 
     def recorded(scene: str) -> list[Path]:
         return [path for path in sorted(folder.glob(f"sensor-*/{scene}-*.h5")) if ".truth." not in path.name]
 
-    for path in recorded("rotary-sphere") + recorded("rotary-target"):
-        print(rotary(path), flush=True)
     rows = []
+    for scene in ("rotary-sphere", "rotary-target"):
+        found = np.array([rotary(path) for path in recorded(scene)])
+        cells = (f"{np.sqrt(np.mean(each**2)):.3f}" for each in found.T)
+        rows.append([scene, f"{len(found)}", *cells])
+    head = ["scene", "campaigns", "angle, rms deg", "stated", "position, rms mm", "stated"]
+    tables, errors = {"rotary table": table(head, rows)}, []
     for path in recorded("pipe-five-sides"):
         calibration = uwlts.read(path.parent / "calibration.json")
         assert isinstance(calibration, Calibration)
         robot = captured(path.parent / path.name.replace("pipe-five-sides", "robot-sphere"))
         mount = uwlts.calibrate_mount(robot.select(np.arange(FOR_THE_MOUNT)), radius_mm=RADIUS_MM)
-        rows.append(pipe(path, calibration, mount))
-        print(f"{path.parent.name}, {path.stem}: diameter, ovality, largest step, largest closure, mm", flush=True)
-        print(
-            "by the poses; registered freely, with the poses known, with spheres besides:",
-            *np.round(rows[-1], 3),
-            sep="\n",
-        )
-    if rows:
-        sizes = np.abs(rows)
-        print("registered", *np.isfinite(sizes[:, :, 0]).sum(axis=0))
-        print("mean of the sizes", *np.round(np.nanmean(sizes, axis=0), 3), sep="\n")
-        print("largest", *np.round(np.nanmax(sizes, axis=0), 3), sep="\n")
-    if (path := folder / "vehicle.h5").exists():
-        print(vehicle(path))
+        errors.append(pipe(path, calibration, mount))
+        print(path.parent.name, path.stem, *np.round(errors[-1], 3), sep="\n", flush=True)
+    sizes, rows = np.abs(errors), []
+    for number, name in enumerate(("from poses and mount", "registered freely", "poses known", "and ten spheres")):
+        own = sizes[np.isfinite(sizes[:, number, 0]), number]
+        cells = (f"{each.mean():.3f} ({each.max():.3f})" if np.isfinite(each).all() else "" for each in own.T)
+        rows.append([name, f"{len(own)} of {len(sizes)}", *cells])
+    head = ["views", "campaigns", "diameter mm", "ovality mm", "largest step mm", "largest closure as stated mm"]
+    publish(tables | {"pipe from five views": table(head, rows)}, write=write)
 
 
 if __name__ == "__main__":

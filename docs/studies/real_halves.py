@@ -1,6 +1,6 @@
 """Residuals that the second half of each set of real images must show, computed from the first half.
 
-    python -m docs.studies.real_halves --write             # the expectations, without the second halves
+    python -m docs.studies.real_halves                     # the expectations, without the second halves
     python -m docs.studies.real_halves --measured --write  # also what the second halves show
 
 Halves are every second image of a set, or every second window of 64 lines of a single image (`tests/data`). A residual
@@ -86,23 +86,20 @@ class Row:
         return cls(name, residual, unit, limits(first), limits(stated) if len(stated) else None, found)
 
     def cells(self) -> list[str]:
-        """Return the cells of the table; three more if the second half is known."""
-
-        def text(limits: tuple[float, float, float] | None) -> str:
-            if limits is None:
-                return "nothing"
-            value, low, high = (f"{each:.0f}" if abs(each) > 100 else f"{each:.3g}" for each in limits)
-            return f"{value} ({low} to {high})"
-
-        cells = [self.name, f"{self.residual}, {self.unit}".removesuffix(", "), text(self.expected), text(self.stated)]
-        if self.found is not None:
-            cells.append(f"{self.found:.0f}" if self.found > 100 else f"{self.found:.3g}")
+        """Return the cells of the table: expected intervals, or if the second half is known its ratios to them."""
+        cells = [self.name, f"{self.residual}, {self.unit}".removesuffix(", ")]
+        if self.found is None:
             for limits in (self.expected, self.stated):
-                if limits is None:
-                    cells.append("")
-                    continue
-                ratio = f", {self.found / limits[0]:.2f}" if limits[0] > 0 else ""
-                cells.append(f"{'yes' if limits[1] <= self.found <= limits[2] else '**no**'}{ratio}")
+                known = [f"{each:.0f}" if abs(each) > 100 else f"{each:.3g}" for each in limits or ()]
+                cells.append("{} ({} to {})".format(*known) if known else "nothing")
+            return cells
+        cells.append(f"{self.found:.0f}" if self.found > 100 else f"{self.found:.3g}")
+        for limits in (self.expected, self.stated):
+            if limits is None:
+                cells.append("")
+                continue
+            ratio = f"{self.found / limits[0]:.2f}" if limits[0] > 0 else "inside"
+            cells.append(ratio if limits[1] <= self.found <= limits[2] else f"{ratio}, outside")
         return cells
 
 
@@ -321,8 +318,8 @@ def main(*, measured: bool = False, write: bool = False) -> None:
             *etna(measured, folder),
             *gap_rows(measured, folder),
         ]
-    head = ["set", "residual", "expected by the first half", "expected as stated"]
-    head += ["second half", "as the first half, ratio", "as stated, ratio"] if measured else []
+    head = ["second half", "relative to that of the first", "relative to the stated"] if measured else []
+    head = ["set", "residual", *(head or ("expected by the first half", "expected as stated"))]
     title = "real halves, measured" if measured else "real halves, expected"
     publish({title: table(head, [row.cells() for row in rows])}, write=write)
 

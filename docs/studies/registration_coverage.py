@@ -7,6 +7,7 @@ poses have errors of up to 0.8 mm and 0.4 deg. Errors of the poses are whitened 
 """
 
 import sys
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -66,17 +67,16 @@ def main(*, count: int = 6, first: int = 1000, write: bool = False) -> None:
     """Print the table; with `--write`, put it into its page. Refused registrations are counted, not averaged."""
     rows, total = [], []
     for errors in ERRORS:
-        for shape in SHAPES:
-            own = []
-            for seed in range(first, first + count):
-                try:
-                    own.append(judge(seed, shape, errors))
-                except EvaluationError as error:
-                    print(f"{shape}, {errors}, {seed}: {error}", file=sys.stderr)
-            total += own
-            rows.append([errors, shape, *_describe(own, count)])
-    rows.append(["all", "all", *_describe(total, count * len(rows))])
-    head = ["errors", "shape", "registrations", "chi-square per degree of freedom", "largest", "within 95 %"]
+        own = []
+        for shape, seed in product(SHAPES, range(first, first + count)):
+            try:
+                own.append(judge(seed, shape, errors))
+            except EvaluationError as error:
+                print(f"{shape}, {errors}, {seed}: {error}", file=sys.stderr)
+        total += own
+        rows.append([errors, *_describe(own, count * len(SHAPES))])
+    rows.append(["all", *_describe(total, count * len(SHAPES) * len(rows))])
+    head = ["errors", "registrations", "chi-square per degree of freedom", "largest", "within 95 %"]
     publish({"coverage of registrations": table(head, rows)}, write=write)
 
 

@@ -1,20 +1,16 @@
-"""Meshes of rendered scans against their true surfaces, and Open3D's Poisson reconstruction of the same points.
+"""Meshes of the rendered scans of `inspection.py` against their true surfaces.
 
-    python docs/studies/rendered_mesh.py runs/inspection            # after docs/studies/inspection.py
-    python docs/studies/poisson_mesh.py runs/inspection             # in an environment with Open3D
-    python docs/studies/rendered_mesh.py runs/inspection            # again, with its meshes
-
-Errors are those of the vertices, along the normal, against the closed form of a corroded pipe and of a flange's face.
+Errors are those of the vertices, along the normal, against the closed form of a corroded pipe, of a flange's face, and
+of both sides of a thin plate.
 """
 
 from pathlib import Path
 
 import numpy as np
-from cyclopts import App
-from inspection import cloud_of
-from inspection_scenes import AXIS_Z_MM, WATERS, large_pits, radius_mm
-from result_tables import publish, table
+from inspection_scenes import AXIS_Z_MM, WATERS, cloud_of, large_pits, radius_mm
+from result_tables import table
 from scipy.spatial import KDTree
+from thin_wall import SIDES, off_plate, side_cloud
 
 import uwlts
 from twin.scene.description import load_scene
@@ -49,26 +45,18 @@ def off_flange(folder: Path, water: str):
     return off
 
 
-def row(name: str, vertices: np.ndarray, std: np.ndarray | None, off: np.ndarray, points: np.ndarray) -> list[str]:
-    """Return a row of the table: number, rms, bias, coverage, and vertices on surfaces that were not seen."""
-    beyond = KDTree(points).query(vertices)[0] > SEEN_MM
+def row(name: str, made: uwlts.SurfaceMesh, off: np.ndarray, points: np.ndarray) -> list[str]:
+    """Return a row of the table: errors (N,) of the vertices, coverage, and vertices on surfaces that were not seen."""
+    beyond = KDTree(points).query(made.vertices_mm)[0] > SEEN_MM
     known = np.isfinite(off) & ~beyond
-    error = off[known]
-    inside = "-" if std is None else f"{100 * np.mean(np.abs(error) <= 1.96 * std[known]):.0f} %"
-    return [
-        name,
-        f"{len(vertices):,}",
-        f"{1e3 * np.sqrt(np.mean(error**2)):.1f}",
-        f"{1e3 * error.mean():+.1f}",
-        "-" if std is None else f"{1e3 * np.sqrt(np.mean(std[known] ** 2)):.1f}",
-        inside,
-        f"{100 * beyond.mean():.1f} %",
-        f"{100 * np.mean(~np.isfinite(off) & ~beyond):.1f} %",
-    ]
+    error, std = off[known], made.std_mm[known]
+    sizes = f"{np.sqrt(np.mean(error**2)):.1f}", f"{error.mean():+.1f}", f"{1e3 * np.sqrt(np.mean(std**2)):.1f}"
+    inside = f"{100 * np.mean(np.abs(error) <= 1.96e3 * std):.0f} %"
+    return [name, f"{len(off):,}", *sizes, inside, f"{100 * beyond.mean():.1f} %"]
 
 
-def main(folder: Path, *, write: bool = False) -> None:
-    """Mesh and print the table; with `--write`, put it into its page."""
+def mesh_table(folder: Path) -> str:
+    """Return the table of meshes of a folder with recordings."""
     rows = []
     for water in WATERS:
         for name, cloud, off in (
@@ -76,26 +64,10 @@ def main(folder: Path, *, write: bool = False) -> None:
             ("flange", cloud_of(folder, "flanges", f"flange-{water}"), off_flange(folder, water)),
         ):
             made = uwlts.mesh(cloud)
-            rows.append(row(f"{name}, {water}", made.vertices_mm, made.std_mm, off(made.vertices_mm), cloud.points_mm))
-            saved = folder / f"mesh-{name.split()[-1]}-{water}.npz"
-            np.savez(saved, points=cloud.points_mm)
-            poisson = saved.with_suffix(".poisson.npz")
-            if poisson.exists():
-                vertices = np.load(poisson)["vertices"]
-                rows.append(row(f"{name}, {water}, Open3D", vertices, None, off(vertices), cloud.points_mm))
-            print(rows[-1], flush=True)
-    head = [
-        "mesh",
-        "vertices",
-        "rms, um",
-        "bias, um",
-        "stated, um",
-        "within 95 %",
-        "where nothing was seen",
-        "off the edges",
-    ]
-    publish({"rendered meshes": table(head, rows)}, write=write)
-
-
-if __name__ == "__main__":
-    App(help=__doc__, help_format="plaintext", default_command=main)()
+            rows.append(row(f"{name}, {water}", made, 1e3 * off(made.vertices_mm), cloud.points_mm))
+    clouds = [side_cloud(folder, side) for side in SIDES]
+    made = uwlts.mesh(*clouds, towards=[[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
+    points = np.concatenate([cloud.points_mm for cloud in clouds])
+    rows.append(row("plate of 2 mm, both sides", made, 1e3 * off_plate(made.vertices_mm), points))
+    head = ["mesh", "vertices", "rms, µm", "bias, µm", "stated (1 std), µm", "truth within 95 %"]
+    return table([*head, "vertices more than 1 mm from all points"], rows)

@@ -1,20 +1,20 @@
 """Errors of multiply scattered light: percentiles and spatial spectrum of frames against many more walks.
 
-    python docs/studies/scattered_light.py frames coastal FILE.npz          # frames of two spheres, 16 samples
-    python docs/studies/scattered_light.py reference coastal FILE.npz       # plain means of many walks per cell
-    python docs/studies/scattered_light.py compare PICTURE.svg REFERENCE.npz,FRAMES.npz[,MORE.npz] ...
+    python docs/studies/scattered_light.py [--write]                # 16 frames of two spheres, 16 samples, two waters
+    python docs/studies/scattered_light.py reference coastal FILE.npz   # plain means of many walks per cell
 
 The reference is the plain mean of 4,800 random walks per cell, or 64,800 within 48 px of the stripe. It takes about
-4 min of processor time; `tests/data/scattered-WATER.npz` are examples. Grey values are scaled to a stripe's peak of
-200.
+4 min of processor time; those of the table are `tests/data/scattered-WATER.npz`. Grey values are scaled to a stripe's
+peak of 200.
 """
 
-import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from cyclopts import App
+from result_tables import publish, table
 
 if TYPE_CHECKING:
     from twin.light.renderer import Renderer
@@ -27,11 +27,13 @@ PARTS, WALKS, MORE_WALKS, NEAR_PX = 12, 400, 5000, 48
 The scatter of the parts gives the error of the reference.
 """
 PEAK_DN = 200.0
-AWAY_PX = (0, 16, 32)
+AWAY_PX = (0, 32)
+WATERS = "coastal", "harbour"
+DOCS = Path(__file__).resolve().parents[1]
 
 
-def render(kind: str, water: str, out: Path, *, seed: int) -> None:
-    """Write the scattered light of frames (N, H, W) and the stripe, or the cells of a reference and their error."""
+def make_renderer(water: str) -> "Renderer":
+    """Return the renderer of two spheres in a named water."""
     from tests.bench.light import in_named_water
     from twin.light.renderer import Renderer
     from twin.rendering_options import use_variant
@@ -39,16 +41,16 @@ def render(kind: str, water: str, out: Path, *, seed: int) -> None:
 
     use_variant()
     sensor = in_named_water(water)
-    renderer = Renderer(sensor, sensor.media["water"], load_scene("spheres"))
-    count = SEEDS if kind == "frames" else 1
-    frames = [renderer.laser_frame(np.eye(4), spp=SPP, seed=seed + k) for k in range(count)]
-    direct = frames[0].direct()
-    if kind == "frames":
-        np.savez(out, scattered=np.array([frame.scattered - frame.haze for frame in frames]), direct=direct)
-    else:
-        means = np.array([reference(renderer, away_from(direct), seed=90001 + 977 * (seed + k)) for k in range(PARTS)])
-        error = means.std(axis=0, ddof=1) / np.sqrt(PARTS)
-        np.savez_compressed(out, scattered=means.mean(axis=0).astype(np.float32), error=error.astype(np.float16))
+    return Renderer(sensor, sensor.media["water"], load_scene("spheres"))
+
+
+def write_reference(water: str, out: Path, *, seed: int = 0) -> None:
+    """Write the cells of a reference and their error."""
+    renderer = make_renderer(water)
+    direct = renderer.laser_frame(np.eye(4), spp=SPP, seed=seed).direct()
+    means = np.array([reference(renderer, away_from(direct), seed=90001 + 977 * (seed + k)) for k in range(PARTS)])
+    error = means.std(axis=0, ddof=1) / np.sqrt(PARTS)
+    np.savez_compressed(out, scattered=means.mean(axis=0).astype(np.float32), error=error.astype(np.float16))
 
 
 def reference(renderer: "Renderer", distance: np.ndarray, *, seed: int) -> np.ndarray:
@@ -88,50 +90,40 @@ def spectrum(errors: np.ndarray, side: int = 256) -> tuple[np.ndarray, np.ndarra
     return np.arange(1, side // 2) / side, np.sqrt(mean[1 : side // 2])
 
 
-def compare(picture: Path, groups: list[list[Path]]) -> None:
-    """Print the errors of frames against the reference, the first file of each group, and draw their spectra."""
+def main(*, write: bool = False) -> None:
+    """Print the table; with `--write`, put it into its page, and draw the spectra."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(figsize=(5.5, 3.5), layout="constrained")
-    for cells, *files in groups:
-        for path in files:
-            data = np.load(path)
-            scale = PEAK_DN / data["direct"].max()
-            height, width = data["direct"].shape
-            truth = cv2.resize(scale * np.load(cells)["scattered"], (width, height), interpolation=cv2.INTER_LINEAR)
-            errors = scale * data["scattered"] - truth
-            distance = away_from(data["direct"])
-            for px in AWAY_PX:
-                away = distance > px
-                some = np.abs(errors[:, away])
-                means = errors[:, away].mean(axis=1) / truth[away].mean()
-                print(
-                    f"{path.stem:24s} farther than {px:2d} px: 99.9th percentile {np.percentile(some, 99.9):.2f}, "
-                    f"largest {some.max():.2f}, rms {np.sqrt((some**2).mean()):.3f} DN, "
-                    f"mean {100 * means.mean():+.2f} +/- {100 * means.std(ddof=1) / np.sqrt(len(means)):.2f} %"
-                )
-            axes.loglog(*spectrum(errors), label=path.stem)
+    rows = []
+    for water in WATERS:
+        renderer = make_renderer(water)
+        frames = [renderer.laser_frame(np.eye(4), spp=SPP, seed=seed) for seed in range(SEEDS)]
+        direct, scattered = frames[0].direct(), np.array([frame.scattered - frame.haze for frame in frames])
+        scale, (height, width) = PEAK_DN / direct.max(), direct.shape
+        cells = np.load(DOCS.parent / "tests" / "data" / f"scattered-{water}.npz")["scattered"]
+        truth = cv2.resize(scale * cells, (width, height), interpolation=cv2.INTER_LINEAR)
+        errors, distance = scale * scattered - truth, away_from(direct)
+        for px in AWAY_PX:
+            away = distance > px
+            some = np.abs(errors[:, away])
+            means = 100 * errors[:, away].mean(axis=1) / truth[away].mean()
+            name = f"{water}, farther than {px} px from the stripe" if px else water
+            sizes = f"{np.percentile(some, 99.9):.2f}", f"{some.max():.1f}", f"{np.sqrt((some**2).mean()):.3f}"
+            rows.append([name, *sizes, f"{means.mean():+.1f} ± {means.std(ddof=1) / np.sqrt(len(means)):.1f} %"])
+        axes.loglog(*spectrum(errors), label=water)
+    head = ["water", "99.9th percentile", "largest", "rms", "mean against the reference"]
+    publish({"scattered light": table(head, rows)}, write=write)
     axes.set(xlabel="spatial frequency in 1/px", ylabel="amplitude of the error in DN")
     axes.legend()
-    figure.savefig(picture)
-
-
-def main() -> None:
-    """Render or compare."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("kind", choices=("frames", "reference", "compare"))
-    parser.add_argument("what", help="a named water, or the picture to draw")
-    parser.add_argument("files", nargs="+")
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
-    if arguments.kind == "compare":
-        compare(Path(arguments.what), [[Path(each) for each in group.split(",")] for group in arguments.files])
-    else:
-        render(arguments.kind, arguments.what, Path(arguments.files[0]), seed=arguments.seed)
+    if write:
+        figure.savefig(DOCS / "pictures" / "scattered-light.svg")
 
 
 if __name__ == "__main__":
-    main()
+    app = App(help=__doc__, help_format="plaintext", default_command=main)
+    app.command(write_reference, name="reference")
+    app()

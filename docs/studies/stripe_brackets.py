@@ -43,12 +43,10 @@ CASES = {
 }
 
 
-def rows() -> Iterator[str]:
+def rows() -> Iterator[list[str]]:
     from twin.recording.frame_truth import find_true_stripe
     from twin.recording.sensor_simulator import SensorSimulator
 
-    yield "| scene | surface | image | lines found % | bias px | std px |"
-    yield "| --- | --- | --- | --- | --- | --- |"
     for name, (of, surfaces) in CASES.items():
         studio, sensor = SensorSimulator(load_sensor("thesis"), of, Options(spp=64)), load_sensor("thesis")
         exposure = studio.exposure_ms["laser"] * np.array(BRACKET)

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 from result_tables import publish, table
-from stripe_cases import CROSSING, FILTERED, MASS, VERTEX, Frames, measure
+from stripe_cases import CROSSING, FILTERED, MASS, VERTEX, measure
 from stripe_plan import NAME_CORE, PLACES, Plan
 
 from twin.rendering_options import use_variant
@@ -22,31 +22,13 @@ SHOWN = (CROSSING, MASS, "quadratic", FILTERED, VERTEX)
 
 
 def effects_table(plan: Plan) -> str:
-    """Bias and spread on the plane by effect and place."""
-    cases, columns = plan.effects("plane"), ("bias px", "std px", "std mm")
-    rows = []
+    """Spread on the plane by effect and place, and the bias of largest size."""
+    cases, rows = plan.effects("plane"), []
     for name in dict.fromkeys(name for name, _ in cases):
-        cells = [name]
-        for place in PLACES["plane"]:
-            s = measure(cases[name, place]).spread()
-            cells += [format_fixed(s.bias_px, signed=True), f"{s.std_px:.3f} ± {s.std_px_error:.3f}", f"{s.std_mm:.4f}"]
-        rows.append(cells)
-    return table(["effects", *(f"{place}: {column}" for place in PLACES["plane"] for column in columns)], rows)
-
-
-def methods_table(plan: Plan) -> str:
-    """Spread in mm by method of extraction, with noise, speckle and defocus."""
-    cases = {(thing, place): plan.effects(thing)[NAME_CORE, place] for thing in PLACES for place in PLACES[thing]}
-    rows = [
-        [name, *(f"{_spread(measure(case), name, thing):.3f}" for (thing, _), case in cases.items())] for name in SHOWN
-    ]
-    return table(["method", *(f"{thing}, {place}" for thing, place in cases)], rows)
-
-
-def _spread(frames: Frames, method: str, thing: str) -> float:
-    """Return the standard deviation in mm; for spheres the robust one, because of outliers at their limbs."""
-    spread = frames.spread(method)
-    return spread.std_mm if thing == "plane" else spread.robust_mm
+        spreads = [measure(cases[name, place]).spread() for place in PLACES["plane"]]
+        bias = max((each.bias_px for each in spreads), key=abs)
+        rows.append([name, *(f"{each.std_mm:.4f}" for each in spreads), format_fixed(bias, signed=True)])
+    return table(["effects", *(f"std mm, {place}" for place in PLACES["plane"]), "largest bias px"], rows)
 
 
 def unknown_table(plan: Plan) -> str:
@@ -76,7 +58,7 @@ def main() -> None:
             measure(case)
             progress(number, len(cases))
     draw_all(plan, PICTURES)
-    tables = {"effects": effects_table(plan), "methods": methods_table(plan), "unknown": unknown_table(plan)}
+    tables = {"effects": effects_table(plan), "unknown": unknown_table(plan)}
     publish({f"stripe errors, {name}": text for name, text in tables.items()}, write=given.write)
     print(f"{len(cases)} cases, {sum(case.frames for case in cases)} frames in {time.perf_counter() - start:.0f} s")
 

@@ -7,14 +7,13 @@ the page.
 """
 
 import argparse
-import math
 import time
 from functools import cache
 
 import numpy as np
 from circle_methods import circles_table
 from method_limits import bound_px, grain_px, spot_limit_px
-from method_shots import LEVELS, Place, Spread, places, render, round_to_zero, sweeps
+from method_shots import LEVELS, Place, Spread, places, render, round_to_zero
 from result_tables import publish, table
 from stripe_cases import FILTERED, MASS, METHODS
 
@@ -56,31 +55,6 @@ def spread_table(frames: int) -> str:
     )
 
 
-def bias_table(frames: int) -> str:
-    """Mean error in px by method and place, with all effects, and its standard error."""
-    rows = [[name, *(_signed(spread(p, name, frames).bias_px) for p in places().values())] for name in ALL_METHODS]
-    errors = [_mean_error(spread(p, FIT, frames), p, frames) for p in places().values()]
-    return table(["bias in px", *places()], [*rows, ["standard error of the profile fit's", *errors]])
-
-
-def _mean_error(s: Spread, place: Place, frames: int) -> str:
-    lines = np.isfinite(render(place).truth_px).sum() * frames
-    return f"{s.std_px / math.sqrt(lines):.3f}"
-
-
-def sweep_table(frames: int) -> str:
-    """Return bias and standard deviation in px with one changed parameter."""
-    rows = []
-    for name, place in sweeps().items():
-        cells = [name]
-        for method in (FIT, MASS, CROSSING, FILTERED):
-            s = spread(place, method, frames)
-            cells += [_signed(s.bias_px), f"{s.std_px:.3f}"]
-        rows.append(cells)
-    methods = (FIT, MASS, CROSSING, FILTERED)
-    return table(["plane", *(f"{m}: {c}" for m in methods for c in ("bias px", "std px"))], rows)
-
-
 def exposure_table(frames: int) -> str:
     """Bias and standard deviation in px by exposure, on the plane at the stand-off."""
     place, rows = places()["plane, stand-off"], []
@@ -88,19 +62,18 @@ def exposure_table(frames: int) -> str:
         fit = spread(place, FIT, frames, level)
         cells = [f"{level:g}", f"{100 * fit.found:.1f} %", _signed(fit.bias_px), f"{fit.std_px:.3f}"]
         cells += [f"{spread(place, name, frames, level).std_px:.3f}" for name in (MASS, CROSSING, FILTERED)]
-        cells += [f"{spread(place, name, frames, level, False).std_px:.4f}" for name in (FIT, CROSSING)]
         rows.append(cells)
     head = ["exposure / automatic", "lines found", f"{FIT}: bias px", f"{FIT}: std px"]
     head += [f"{name}: std px" for name in (MASS, CROSSING, FILTERED)]
-    return table([*head, f"without speckle, {FIT}: std px", f"without speckle, {CROSSING}: std px"], rows)
+    return table(head, rows)
 
 
 def limits_table(frames: int) -> str:
     """Standard deviations on single lines beside the limits, px."""
     rows = []
-    wanted = {name: place for name, place in places().items() if name.startswith("plane")}
-    wanted |= {name: place for name, place in sweeps().items() if name.startswith("waist")}
-    for name, place in wanted.items():
+    for name, place in places().items():
+        if not name.startswith("plane"):
+            continue
         shot = render(place)
         cells = [name, f"{bound_px(shot, speckle=False):.4f}"]
         cells += [f"{spread(place, m, frames, 1.0, False).std_px:.4f}" for m in ONE_LINE if m != "quadratic"]
@@ -110,21 +83,6 @@ def limits_table(frames: int) -> str:
     three = [m for m in ONE_LINE if m != "quadratic"]
     head = ["plane, std px", "noise only: bound", *three, "speckle grain px", "limit of a spot", "limit of a line"]
     return table([*head, *(f"all, {m}" for m in three)], rows)
-
-
-def lateral_table(frames: int) -> str:
-    """Return standard deviations of single lines and of means of five neighbours, px, and the lines lost at edges."""
-    rows = []
-    for name in (FIT, FIT_FIVE, MASS, FILTERED):
-        cells = [name]
-        for place in ("plane, near", "plane, far"):
-            s = spread(places()[place], name, frames)
-            cells += [f"{s.std_px:.3f}", f"{s.five_px:.3f}"]
-        limb = spread(places()["sphere, near"], name, frames)
-        cells += [f"{100 * limb.far_off:.2f} %", f"{100 * limb.found:.1f} %"]
-        rows.append(cells)
-    head = ["plane, std px", *(f"{p}: {c}" for p in ("near", "far") for c in ("one line", "mean of five"))]
-    return table([*head, "sphere, near: more than 2 px off", "lines found"], rows)
 
 
 def _signed(value: float) -> str:
@@ -139,18 +97,15 @@ def main() -> None:
     given, start = parser.parse_args(), time.perf_counter()
     frames = given.frames
     use_variant()
-    wanted = [*places().values(), *sweeps().values()]
+    wanted = [*places().values()]
     with progress_bar("places") as progress:
         for number, place in enumerate(wanted, start=1):
             render(place)
             progress(number, len(wanted))
     tables = {
         "spread": spread_table(frames),
-        "bias": bias_table(frames),
         "limits": limits_table(frames),
-        "sweeps": sweep_table(frames),
         "exposure": exposure_table(frames),
-        "lateral": lateral_table(frames),
         "circles": circles_table(),
     }
     publish({f"stripe methods, {name}": text for name, text in tables.items()}, write=given.write)

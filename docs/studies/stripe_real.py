@@ -1,4 +1,4 @@
-"""Scatter of the stripe methods on real stripes by others (tests/data): python docs/studies/stripe_real.py.
+"""Scatter of the stripe methods on real stripes by others (tests/data): python docs/studies/stripe_real.py [--write].
 
 The scatter is the root mean square distance, px, of a centre from the parabola through the centres on the twelve lines
 on either side, on the lines that all methods find. Distances above 3 px, at edges of the objects, are left out.
@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from cyclopts import App
+from result_tables import publish, table
 
 from uwlts.storage.image_file import read_image
 from uwlts.stripe import PeakRule, StripeOptions, extract_stripe, method_names
@@ -32,7 +33,7 @@ def stripes() -> Iterator[tuple[str, np.ndarray, np.ndarray | None, PeakRule]]:
             yield f"{folder}, {rule}, background subtracted", lit, dark, rule
     for number in range(1, 17):
         image = read_image(DATA / "etna" / f"frame{number:04d}.jpg")
-        yield f"saturated {number}", image, None, PeakRule.STRONGEST
+        yield "16 saturated views, mean", image, None, PeakRule.STRONGEST
 
 
 def scatter(centre: np.ndarray) -> float:
@@ -47,11 +48,10 @@ def scatter(centre: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values[np.abs(values) < LARGEST_PX]))))
 
 
-def main() -> None:
-    """Print the table."""
-    names = method_names()
-    print("| stripe | lines found % |", " | ".join(f"{name} px" for name in names), "| default / best simple |")
-    print("| --- " * (len(names) + 3) + "|")
+def main(*, write: bool = False) -> None:
+    """Print the table; with `--write`, put it into its page."""
+    names, default = method_names(), StripeOptions().method
+    rows: dict[str, list[list[float]]] = {}
     for called, image, background, rule in stripes():
         centres = {
             name: extract_stripe(
@@ -61,9 +61,14 @@ def main() -> None:
         }
         both = np.isfinite(list(centres.values())).all(axis=0)
         found = {name: scatter(np.where(both, values, np.nan)) for name, values in centres.items()}
-        default = found.pop(StripeOptions().method)
-        cells = " | ".join(f"{found.get(name, default):.3f}" for name in names)
-        print(f"| {called} | {100 * both.mean():.0f} | {cells} | {default / min(found.values()):.2f} |", flush=True)
+        best = min(value for name, value in found.items() if name != default)
+        rows.setdefault(called, []).append([100 * both.mean(), *found.values(), found[default] / best])
+    cells = []
+    for called, values in rows.items():
+        lines, *scatters, ratio = np.mean(values, axis=0)
+        cells.append([called, f"{lines:.0f}", *(f"{value:.3f}" for value in scatters), f"{ratio:.2f}"])
+    head = ["stripe", "lines found %", *(f"{name} px" for name in names), f"{default} / best other"]
+    publish({"real stripes": table(head, cells)}, write=write)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Wrong and lost points on scenes with mirrors and inside corners: the brightest peak, and the direct stripe.
 
-``python docs/studies/stripe_reflections.py`` prints the tables of docs/results/reflections.md and draws their
-picture; ``--write`` puts the first two there. A point is correct within 3 px of a true position, otherwise wrong. True
+``python docs/studies/stripe_reflections.py`` prints each scene and the table of docs/results/reflections.md, and draws
+its picture; ``--write`` puts the table there. A point is correct within 3 px of a true position, otherwise wrong. True
 positions are the intersections of the sheet's middle with surfaces, and the stripes of direct light, which differ if an
 edge cuts the sheet. A profile line is lost if the sheet's middle lights a surface there and no point is correct. The
 parameters of the rule were chosen only on the named scenes, with a small camera.
@@ -119,9 +119,6 @@ NAMED = {
     ),
     "sphere on paint": scene(sphere(), block((160, 200, 10), (0, 0, 30), finish="painted"), turned=(5, 5, 0)),
 }
-
-HELD_OUT = tuple(range(3000, 3016))
-"""Seeds of scenes drawn at random, seen by the thesis's sensor."""
 
 OTHERS_DRAWN = tuple(range(5000, 5015))
 """Seeds of scenes drawn at random, seen by the other sensors in turn."""
@@ -307,43 +304,33 @@ def wrong_and_lost(of: Rendered, options: StripeOptions) -> tuple[float, float, 
 
 
 def groups(seeds: range) -> Iterator[tuple[str, Iterator[tuple[str, Rendered]]]]:
-    """Yield the images of all tables, rendered on demand; with ``seeds`` only scenes drawn with them."""
-    small, full = load_sensor("thesis-small"), load_sensor("thesis")
-    if seeds:
-        turns = (small, SHORT, HIGH, NOISY)
-        fresh = ((drawn(n)[0], rendered_small(drawn(n)[1], turns[k % 4], n)) for k, n in enumerate(seeds))
-        yield "four sensors, drawn", fresh
-        return
-    yield "chosen on", ((name, rendered_small(of, small, 0)) for name, of in NAMED.items())
-    turns = (SHORT, HIGH, NOISY)
+    """Yield the images of the rows of the table, rendered on demand."""
+    small, turns = load_sensor("thesis-small"), (SHORT, HIGH, NOISY)
+    yield "rule chosen on these", ((name, rendered_small(of, small, 0)) for name, of in NAMED.items())
     yield (
-        "other sensors",
+        "three other sensors, seen before the last changes",
         chain(
             ((name, rendered_small(of, by, 7 + n)) for n, (name, (by, of)) in enumerate(OTHERS.items())),
             ((drawn(n)[0], rendered_small(drawn(n)[1], turns[n % 3], n)) for n in OTHERS_DRAWN),
         ),
     )
-    yield "named, thesis's sensor", ((name, rendered(of, full)) for name, of in NAMED.items())
-    yield "drawn, thesis's sensor: unseen", ((drawn(n)[0], rendered(drawn(n)[1], full)) for n in HELD_OUT)
+    four = (small, *turns)
+    fresh = ((drawn(n)[0], rendered_small(drawn(n)[1], four[k % 4], n)) for k, n in enumerate(seeds))
+    yield f"four sensors, drawn by {seeds.start} to {seeds.stop - 1}", fresh
 
 
-def tables(seeds: range) -> Iterator[tuple[str, str]]:
-    """Yield title and table of each group of scenes."""
+def rows(seeds: range) -> Iterator[list[str]]:
+    """Yield a row for each group of scenes; each scene is printed."""
     for title, group in groups(seeds):
-        rows, sums = [], np.zeros((2, 2, 2))
+        sums, worst, scenes = np.zeros((2, 2, 2)), 0.0, 0
         for name, shown in group:
             found = [wrong_and_lost(shown, options) for options in (BRIGHTEST, StripeOptions())]
-            rows.append([name, *(cell for wrong, lost, _, _ in found for cell in (f"{wrong:.2f}", f"{lost:.1f}"))])
+            print(name, *(f"{value:.2f}" for wrong, lost, _, _ in found for value in (wrong, lost)), flush=True)
             sums += [((wrong * count, count), (lost * lines, lines)) for wrong, lost, count, lines in found]
-            if name == PICTURED and len(shown.images) == FRAMES:
-                draw(shown)
+            worst, scenes = max(worst, found[1][0]), scenes + 1
         shares = sums[:, :, 0] / sums[:, :, 1]
-        count = round(sums[1, 0, 1], -2)
-        rows.append(
-            [f"all {count:,.0f} points", *(cell for wrong, lost in shares for cell in (f"{wrong:.2f}", f"{lost:.1f}"))]
-        )
-        head = ["scene", "brightest peak: wrong %", "lost %", "direct stripe: wrong %", "lost %"]
-        yield title, table(head, rows)
+        cells = [f"{value:.{digits}f}" for share in shares for value, digits in zip(share, (2, 1), strict=True)]
+        yield [title, f"{scenes}", f"{sums[1, 0, 1]:,.0f}", *cells, f"{worst:.1f}"]
 
 
 def draw(of: Rendered) -> None:
@@ -367,14 +354,14 @@ def draw(of: Rendered) -> None:
     figure.savefig(PICTURE, dpi=110)
 
 
-def main(*, first: int = 0, count: int = 0, write: bool = False) -> None:
-    """Print the tables; with `--write`, put the first two into their page.
-
-    With a ``count``, only the table of as many scenes drawn with seeds from ``first`` on is printed.
-    """
+def main(*, first: int = 9600, count: int = 40, write: bool = False) -> None:
+    """Print the table, with ``count`` scenes drawn by seeds from ``first`` on; with `--write`, put it into its page."""
     use_variant()
-    for number, (title, text) in enumerate(tables(range(first, first + count))):
-        publish({f"reflections, {title}": text}, write=write and number < 2 and not count)
+    head = ["scenes", "number", "points", "brightest peak: wrong %", "lost %", "direct stripe: wrong %", "lost %"]
+    found = list(rows(range(first, first + count)))
+    publish({"reflections": table([*head, "wrong %, worst scene"], found)}, write=write)
+    if write:
+        draw(rendered(NAMED[PICTURED], load_sensor("thesis")))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Stripes on the finishes of the twin beside real ones: their light along the stripe, and their centre, with a picture.
 
-    python docs/studies/surface_finishes.py --real bust=bust/laser.png etna=etna
+    python docs/studies/surface_finishes.py --real bust=FILE --real etna=FOLDER
 
 Captures stay in a temporary folder. With --write, the table is put into its page, and the picture is drawn.
 """
@@ -38,11 +38,10 @@ def plate_scene(finish: Finish) -> Scene:
 
 
 def cells_of(path: Path) -> list[str]:
-    """Return median, and 5 and 95 % quantiles, of the statistics of an image set's windows."""
+    """Return the medians of the statistics of an image set's windows."""
     values = measure_windows(open_image_set(path), most_images=200).values
     columns = [values[:, [each.name for each in STATISTICS].index(name)] for name in SHOWN]
-    low, middle, high = (np.quantile(columns, share, axis=1) for share in (0.05, 0.5, 0.95))
-    return [str(len(values)), *(f"{b:.2g} ({a:.2g} to {c:.2g})" for a, b, c in zip(low, middle, high, strict=True))]
+    return [str(len(values)), *(f"{value:.2g}" for value in np.median(columns, axis=1))]
 
 
 def main(*, real: tuple[str, ...] = (), write: bool = False) -> None:

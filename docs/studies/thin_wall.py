@@ -1,25 +1,15 @@
-"""Mesh of a rendered plate of 2 mm thickness, scanned from both sides, and Open3D's Poisson reconstruction of it.
+"""Rendered plate of 2 mm thickness with a hole, scanned from both sides.
 
-    python docs/studies/thin_wall.py runs/inspection                # plate, scenes and campaign
-    twin record runs/inspection/plate.toml --out runs/inspection/plate
-    python docs/studies/thin_wall.py runs/inspection docs/pictures  # after docs/studies/inspection.py's calibration
-    python docs/studies/poisson_mesh.py runs/inspection             # in an environment with Open3D
-    python docs/studies/thin_wall.py runs/inspection docs/pictures  # again, with its mesh
-
-A round plate with a hole stands square to the laser. A known rotation by 180 deg about the scan's direction, as by a
-rotary table, shows its back.
+It stands square to the laser. A known rotation by 180 deg about the scan's direction, as by a rotary table, shows its
+back.
 """
 
 from dataclasses import replace
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
 import tomli_w
 import trimesh
-from cyclopts import App
-from result_tables import publish, table
-from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 import uwlts
@@ -48,7 +38,7 @@ def plate_mesh() -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices, np.concatenate(faces), process=True)
 
 
-def write_scenes(folder: Path) -> None:
+def write_plate(folder: Path) -> None:
     """Write the plate, its scenes and their campaign."""
     made = plate_mesh()
     made.fix_normals()
@@ -80,83 +70,8 @@ def side_cloud(folder: Path, side: str) -> uwlts.PointCloud:
     return uwlts.reconstruct(posed, folder / "calibration" / "calibration.json")
 
 
-def row(name: str, vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> list[str]:
-    """Return a row of the table: errors of the faces, thickness, coverage, area over the hole, vertices far away."""
+def off_plate(vertices: np.ndarray) -> np.ndarray:
+    """Return the distances (N,) of vertices from the nearer face, mm; NaN near and beyond the edges."""
     radius, z = np.hypot(vertices[:, 0], vertices[:, 1]), vertices[:, 2]
     on = (radius > HOLE_MM + _EDGE_MM) & (radius < OUTER_MM - _EDGE_MM)
-    errors, shares = [], []
-    flat = np.mgrid[-OUTER_MM:OUTER_MM:0.5, -OUTER_MM:OUTER_MM:0.5].reshape(2, -1).T
-    flat = flat[(np.hypot(*flat.T) > HOLE_MM + _EDGE_MM) & (np.hypot(*flat.T) < OUTER_MM - _EDGE_MM)]
-    for sign in (-1, 1):
-        own = on & (sign * z > 0)
-        errors.append(sign * z[own] - THICKNESS_MM / 2)
-        shares.append(np.mean(KDTree(vertices[own, :2]).query(flat)[0] < 1.0) if own.any() else 0.0)
-    whole = trimesh.Trimesh(vertices, faces, process=False)
-    middles = whole.triangles_center
-    in_hole = np.hypot(middles[:, 0], middles[:, 1]) < HOLE_MM - _EDGE_MM
-    closed = float(whole.area_faces[in_hole].sum())
-    beyond = KDTree(points).query(vertices)[0] > 1.0
-    rms = 1e3 * np.sqrt(np.mean(np.concatenate(errors) ** 2))
-    thick = np.median(errors[0]) + np.median(errors[1])
-    return [
-        name,
-        f"{len(vertices):,}",
-        f"{rms:.1f}",
-        f"{1e3 * thick:+.1f}",
-        f"{100 * min(shares):.1f} %",
-        f"{closed:.1f}",
-        f"{100 * beyond.mean():.1f} %",
-    ]
-
-
-def draw(path: Path, meshes: dict[str, trimesh.Trimesh], points: np.ndarray) -> None:
-    """Cuts through the middle of the hole."""
-    figure, axes = plt.subplots(len(meshes), 1, figsize=(9, 2.2 * len(meshes)), sharex=True, layout="constrained")
-    for ax, (name, made) in zip(np.atleast_1d(axes), meshes.items(), strict=True):
-        near = np.abs(points[:, 0]) < 0.3
-        ax.plot(points[near, 1], points[near, 2], ".", color="#bbbbbb", markersize=2, label="points")
-        cut = trimesh.intersections.mesh_plane(made, [1.0, 0.0, 0.0], [0.05, 0.0, 0.0])
-        for number, (start, end) in enumerate(np.asarray(cut)[:, :, 1:]):
-            label = "mesh" if number == 0 else None
-            ax.plot([start[0], end[0]], [start[1], end[1]], color="#2152ac", linewidth=1.2, label=label)
-        ax.set(ylabel="Z / mm", title=name, ylim=(-2.2, 2.2))
-    ax.set(xlabel="along the cut through the hole / mm")
-    np.atleast_1d(axes)[0].legend(frameon=False, loc="center")
-    figure.savefig(path)
-
-
-def main(folder: Path, pictures: Path | None = None, *, write: bool = False) -> None:
-    """Write the scenes; with a folder for pictures, evaluate the rendered scans instead."""
-    if pictures is None:
-        write_scenes(folder)
-    else:
-        judge(folder, pictures, write=write)
-
-
-def judge(folder: Path, pictures: Path, *, write: bool) -> None:
-    """Mesh both sides, print the table and draw the cut."""
-    clouds = [side_cloud(folder, side) for side in SIDES]
-    made = uwlts.mesh(*clouds, towards=[[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
-    points = np.concatenate([cloud.points_mm for cloud in clouds])
-    towards = np.repeat([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]], [len(cloud) for cloud in clouds], axis=0)
-    np.savez(folder / "mesh-plate-clear.npz", points=points, towards=towards)
-    meshes = {"uwlts mesh": trimesh.Trimesh(made.vertices_mm, made.faces, process=False)}
-    poisson = folder / "mesh-plate-clear.poisson.npz"
-    if poisson.exists():
-        saved = np.load(poisson)
-        meshes["Open3D, screened Poisson"] = trimesh.Trimesh(saved["vertices"], saved["faces"], process=False)
-    rows = [row(name, np.asarray(each.vertices), np.asarray(each.faces), points) for name, each in meshes.items()]
-    head = ["mesh", "vertices", "rms, um", "thickness, um", "of both faces", "in the hole, mm2", "> 1 mm from points"]
-    publish({"thin wall": table(head, rows)}, write=write)
-    known = np.hypot(*made.vertices_mm[:, :2].T)
-    on = (known > HOLE_MM + _EDGE_MM) & (known < OUTER_MM - _EDGE_MM)
-    off = np.abs(np.abs(made.vertices_mm[on, 2]) - THICKNESS_MM / 2)
-    print(
-        f"stated {1e3 * np.sqrt(np.mean(made.std_mm[on] ** 2)):.1f} um, truth within 95 %: "
-        f"{100 * np.mean(off <= 1.96 * made.std_mm[on]):.0f} %"
-    )
-    draw(pictures / "mesh-thin-wall.svg", meshes, points)
-
-
-if __name__ == "__main__":
-    App(help=__doc__, help_format="plaintext", default_command=main)()
+    return np.where(on, np.abs(z) - THICKNESS_MM / 2, np.nan)

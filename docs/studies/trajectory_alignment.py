@@ -1,29 +1,22 @@
-"""Alignment of a pass of 20 m with three crossings: errors of the path and of lengths.
+"""Alignment of paths that cross themselves: bounds for kinds of drift, and errors of simulated rides.
 
-    python -m docs.studies.trajectory_alignment --seeds 0 1 2
-    python -m docs.studies.trajectory_alignment --seeds 0 1 2 --navigation
+    python -m docs.studies.trajectory_alignment [--write]
 
-The vehicle and the sea bed are those of `tests/uwlts/path_views.py`, with a drift of 0.3 m and 1 deg. Only the size of
-the drift is given to the alignment. ``--walk`` adds a random walk, a multiple of the drift; ``--loop`` uses 4 m with
-one crossing. With ``--navigation``, vehicle, sea and navigation are those of `scenes/vehicle-pass.toml`, and the
-navigation states its covariance. ``--crossings-given`` closes the crossings at their true poses instead of searching
-for them, with fewer nodes. First it prints the factors (`bounds`) that three exact crossings can
-reduce the path error by, for several kinds of drift.
+The rides are those of `tests/uwlts/path_views.py`. Only the size of the drift is given to the alignment. On passes of
+20 m, the crossings are closed at their true poses instead of searching for them, with fewer nodes.
 """
 
-import argparse
-import tomllib
 from itertools import product
-from pathlib import Path
 
 import numpy as np
+from cyclopts import App
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 import uwlts
+from docs.studies.result_tables import publish, table
 from tests.uwlts.alignment.test_align import LOOP_MM
-from tests.uwlts.path_views import ALTITUDE_MM, STEP_MM, bed, ride, scan
-from twin.scene.platform_kinds import Vehicle
+from tests.uwlts.path_views import ride
 from uwlts.alignment.crossing_search import accept_hypothesis, add_overlaps
 from uwlts.alignment.path_prior import DriftModel, PathPrior, choose_drift_model
 from uwlts.alignment.path_solution import Hypothesis, initial_estimate, settle
@@ -39,13 +32,9 @@ PASS_MM = np.array(
 )
 """Crosses itself at (700, 0), (2000, 0) and (2000, 1600)."""
 SWATH_MM, LENGTH_MM = 140.0, 19_400.0
-INSIDE_MM, PAIRS = 60.0, 20_000
-"""Largest distance of the points of a crossing from its middle, and number of lengths drawn there."""
-NEAR = 200
-"""Images of one pass at a crossing, half a metre."""
 BESIDE = 6
 """Largest difference in pieces between pairs of the same crossing."""
-LOOP_DRIFT = {"drift_mm": 60.0, "drift_deg": 0.3}
+LOOP_DRIFT, PASS_DRIFT = {"drift_mm": 60.0, "drift_deg": 0.3}, {"drift_mm": 300.0, "drift_deg": 1.0}
 CROSSINGS = (0.057, 0.500), (0.124, 0.608), (0.351, 0.691)
 """Crossings of the pass, as fractions of its length."""
 GRID, DRIFTS, EXACT = np.linspace(0.01, 1, 100), 200, 1e-7
@@ -53,105 +42,62 @@ GRID, DRIFTS, EXACT = np.linspace(0.01, 1, 100), 200, 1e-7
 
 The variance corresponds to 0.1 mm for a drift of 0.3 m.
 """
-KINDS = {
-    "steady rate": {"rate": 1.0},
-    "steady rate 50 %, wandering rate 50 %": {"rate": 0.5, "wandering": 0.5},
-    "wandering rate": {"wandering": 1.0},
-    "steady rate 95 %, random walk 5 %": {"rate": 0.95, "walk": 0.05},
-    "steady rate 50 %, random walk 50 %": {"rate": 0.5, "walk": 0.5},
-    "random walk": {"walk": 1.0},
-    "Gauss-Markov rate, correlation time 0.05 of the path": {"wandering": 1.0, "correlation": 0.05},
-    "Gauss-Markov rate, correlation time 0.5 of the path": {"wandering": 1.0, "correlation": 0.5},
-    "half steady rate, half Gauss-Markov rate of 0.2": {"rate": 0.5, "wandering": 0.5, "correlation": 0.2},
-}
 RIDE = {"rate": (1.2**3 - 0.7**3) / 1.5, "wave": 0.2}
 """Drift of `ride`: a rate of 0.7 to 1.2 times the drift, and a wave of a fifth of it."""
+KINDS = {
+    "steady rate": {"rate": 1.0},
+    "wandering rate": {"wandering": 1.0},
+    "random walk": {"walk": 1.0},
+    "Gauss-Markov rate, correlation time 0.05 of the path": {"wandering": 1.0, "correlation": 0.05},
+    "Gauss-Markov rate, correlation time 0.5": {"wandering": 1.0, "correlation": 0.5},
+    "simulated rides: steady rate and a wave of a fifth": RIDE,
+    "these with a random walk of 10 %": RIDE | {"walk": 0.1**2},
+}
+"""Kind of the drift: parts of its variance at the end, see `bounds`."""
+LOOPS, PASSES, WALKS = (10, 11, 12), (40, 41, 42, 45, 46), (43, 44)
+"""Seeds of rides of 4 m with one crossing, and of 20 m with three, without and with a random walk of a tenth."""
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2])
-    parser.add_argument("--drift-mm", type=float, default=300.0)
-    parser.add_argument("--drift-deg", type=float, default=1.0)
-    parser.add_argument("--walk", type=float, default=0.0)
-    parser.add_argument("--loop", action="store_true")
-    parser.add_argument("--navigation", action="store_true")
-    parser.add_argument("--crossings-given", action="store_true")
-    given = parser.parse_args()
-    for words, kind in KINDS.items():
-        print(f"{words}: {bounds(**kind)}", flush=True)
-    print(f"drift of these rides: {bounds(**RIDE | {'walk': given.walk**2})}", flush=True)
-    drift = LOOP_DRIFT if given.loop else {"drift_mm": given.drift_mm, "drift_deg": given.drift_deg}
-    for seed in given.seeds:
-        if given.navigation:
-            print(f"seed {seed}: {errors(*vehicle_ride(seed), {})}", flush=True)
-        else:
-            route = LOOP_MM if given.loop else PASS_MM
-            cloud, reported, true = ride(np.random.default_rng(seed), route, walk=given.walk, **drift)
-            found = given_crossings if given.crossings_given else errors
-            print(f"seed {seed}: {found(cloud, reported, true, true.poses, drift)}", flush=True)
+def main(*, write: bool = False) -> None:
+    """Print the tables; with `--write`, put them into their page."""
+    head = ["drift, of the variance at the end", "displacement", "rates", "size alone"]
+    head += ["coordinates within twice the stated uncertainty", "error / stated, rms", f"worst of {DRIFTS}"]
+    tables = {"drifts": table(head, [[name, *bounds(**kind)] for name, kind in KINDS.items()])}
+    rows = []
+    for name, seeds, walk in (("loop of 4 m", LOOPS, 0.0), ("20 m", PASSES, 0.0), ("20 m, random walk", WALKS, 0.1)):
+        loop = seeds == LOOPS
+        drift, found = (LOOP_DRIFT, aligned) if loop else (PASS_DRIFT, given_crossings)
+        for seed in seeds:
+            cloud, reported, true = ride(np.random.default_rng(seed), LOOP_MM if loop else PASS_MM, walk=walk, **drift)
+            before, after, stated, within = found(cloud, reported, true, drift)
+            cells = [f"{before:.1f}", f"{after:.1f}", f"{stated:.1f}", f"{before / after:.1f}", f"{100 * within:.0f} %"]
+            rows.append([name, str(seed), *cells])
+            print(*rows[-1], flush=True)
+    head = ["ride", "seed", "path, mm", "after, mm", "stated, mm", "reduced by a factor of"]
+    tables["rides"] = table([*head, "coordinates within twice the stated uncertainty"], rows)
+    publish(tables, write=write)
 
 
-def vehicle_ride(seed: int) -> tuple[PointCloud, uwlts.Trajectory, uwlts.Trajectory, np.ndarray]:
-    """Return the cloud along the reported path, the reported and true paths, and the true sensor poses (F, 4, 4)."""
-    scene = tomllib.loads((Path(__file__).parents[2] / "scenes/vehicle-pass.toml").read_text())
-    described = scene["motion"] | {"errors_seed": seed, "true_mount": scene["motion"]["mount"]}
-    vehicle = Vehicle.model_validate(described)
-    course, mount = vehicle.course(), vehicle.mount.matrix()
-    times = np.array([shot.time_s for shot in course.shots], float)
-    sensor, clock = course.poses(times), times + vehicle.clock_offset_s
-    assert course.report is not None
-    reported = uwlts.Trajectory(*course.report)
-    floor, stones = sensor[:, 2, 3].mean() + ALTITUDE_MM, bed(5000.0)
-    # Z of the scene points down, and the bed begins at -0.5 m.
-    frame, line, local = scan(np.random.default_rng(seed), sensor, lambda x, y: floor - stones.ev(x + 200, y + 200))
-    cloud = PointCloud(
-        _placed(reported.poses_at(clock) @ mount, frame, local), np.ones(len(frame)), frame, line, time_s=clock[frame]
-    )
-    return cloud, reported, uwlts.Trajectory(clock, sensor @ np.linalg.inv(mount)), sensor
+def aligned(
+    cloud: PointCloud, reported: uwlts.Trajectory, true: uwlts.Trajectory, drift: dict[str, float]
+) -> tuple[float, float, float, float]:
+    """Return the rms error of the path before and after, mm, the stated one, and the fraction within twice of it.
 
-
-def errors(
-    cloud: PointCloud, reported: uwlts.Trajectory, true: uwlts.Trajectory, sensor: np.ndarray, drift: dict[str, float]
-) -> str:
-    """Return, as text, errors of the path and of lengths between the passes of each crossing, before and after.
-
-    The error of the first position, which no surface determines, is subtracted from those of the path.
+    The error of the first position, which no surface determines, is subtracted.
     """
-    try:
-        found = uwlts.align_trajectory(cloud, reported, **drift)
-    except uwlts.Error as error:
-        return str(error)
-    before, after = (each.poses_at(true.times_s) for each in (reported, found.trajectory))
-    assert cloud.frame is not None
-    mount = np.linalg.inv(true.poses[0]) @ sensor[0]
-    local = _placed(np.linalg.inv(before @ mount), cloud.frame, cloud.points_mm)
-    truth, crossings = _placed(sensor, cloud.frame, local), _crossings(sensor[:, :2, 3])
-    last = max(second for _, second in crossings)
-    off = [each[:, :3, 3] - true.poses[:, :3, 3] for each in (before, after)]
-    own_before, own = (each - each[0] for each in off)
+    found = uwlts.align_trajectory(cloud, reported, **drift)
+    off = [each.poses_at(true.times_s)[:, :3, 3] - true.poses[:, :3, 3] for each in (reported, found.trajectory)]
+    before, after = (each - each[0] for each in off)
     covariance = found.trajectory.covariance_at(true.times_s)
     assert covariance is not None
     std = np.sqrt(np.einsum("nii->ni", covariance[:, :3, :3]))
-    lengths = [
-        _length_error(points, truth, cloud.frame, sensor[:, :2, 3], each)
-        for points in (cloud.points_mm, found.cloud.points_mm)
-        for each in crossings
-    ]
-    count = len(crossings)
-    return (
-        f"path {_size(own_before):.1f} -> {_size(own):.2f} mm (rms), {_size(own_before) / _size(own):.1f} times, "
-        f"{_size(std):.1f} mm stated, {100 * np.mean(np.abs(own) < 2 * std):.0f} % of coordinates within twice it; "
-        f"to the last crossing {_size(own[:last]):.2f} mm, behind it {_size(own[last:]):.1f} mm; lengths between both "
-        f"passes {_rms(lengths[:count]):.1f} -> {_rms(lengths[count:]):.3f} mm of {count} crossings, "
-        f"{len(found.doubtful_s)} left out"
-    )
+    return _size(before), _size(after), _size(std), float(np.mean(np.abs(after) < 2 * std))
 
 
 def given_crossings(
-    cloud: PointCloud, reported: uwlts.Trajectory, true: uwlts.Trajectory, sensor: np.ndarray, drift: dict[str, float]
-) -> str:
-    """Return, as text, errors of the path with each crossing closed at its true pose, without a search.
+    cloud: PointCloud, reported: uwlts.Trajectory, true: uwlts.Trajectory, drift: dict[str, float]
+) -> tuple[float, float, float, float]:
+    """Return the figures of `aligned` with each crossing closed at its true pose, without a search.
 
     The few nodes cannot follow a random walk within a crossing.
     """
@@ -181,11 +127,7 @@ def given_crossings(
     off = reported.poses[:, :3, 3] - true.poses[:, :3, 3]
     left = off + estimate.corrections(reported.times_s)[:, :3]
     std = np.sqrt(np.einsum("nii->ni", estimate.covariance_at(reported.times_s))[:, :3])
-    return (
-        f"path {_size(off):.1f} -> {_size(left):.2f} mm (rms), {_size(off) / _size(left):.1f} times, "
-        f"{_size(std):.1f} mm stated, {100 * np.mean(np.abs(left) < 2 * std):.0f} % of coordinates within twice it; "
-        f"{len(estimate.pairs)} pairs of pieces"
-    )
+    return _size(off), _size(left), _size(std), float(np.mean(np.abs(left) < 2 * std))
 
 
 def _true_pairs(places: list[np.ndarray]) -> list[tuple[int, int]]:
@@ -206,8 +148,8 @@ def _true_pairs(places: list[np.ndarray]) -> list[tuple[int, int]]:
 
 def bounds(
     *, rate: float = 0.0, wandering: float = 0.0, walk: float = 0.0, wave: float = 0.0, correlation: float = np.inf
-) -> str:
-    """Return, as text, the factors that three exact crossings can reduce the rms error of a path by.
+) -> list[str]:
+    """Return the factors that three exact crossings can reduce the rms error of a path by, and the coverage.
 
     The drift is a Gaussian process. Its variance at the end is the sum of ``rate`` (steady rate), ``wandering`` (rate
     with a random walk, or Gauss-Markov rate with a ``correlation`` time) and ``walk`` (random walk). ``wave`` is the
@@ -242,12 +184,9 @@ def bounds(
         after.append(off)
         inside.append(np.abs(off) < 2 * std[:, None])
         sizes.append(_rms(off / std[:, None]))
-    return (
-        f"at best {min(found[0], 1000):.1f} times, {min(found[1], 1000):.1f} with the rates within crossings; by the "
-        f"model of a drift of known size {_rms(np.array(before)) / _rms(np.array(after)):.1f} times, "
-        f"{100 * np.mean(inside):.0f} % within twice what is stated; errors of one drift are {_rms(sizes):.2f} times "
-        f"those stated (rms), {max(sizes):.1f} times in the worst of {DRIFTS}"
-    )
+    factors = ["exact" if value > 1000 else f"{value:.1f}" for value in found]
+    size = f"{_rms(np.array(before)) / _rms(np.array(after)):.1f}"
+    return [*factors, size, f"{100 * np.mean(inside):.0f} %", f"{_rms(sizes):.2f}", f"{max(sizes):.1f}"]
 
 
 def _wandered(first: np.ndarray, second: np.ndarray, correlation: float) -> np.ndarray:
@@ -286,30 +225,5 @@ def _size(vectors: np.ndarray) -> float:
     return _rms(np.linalg.norm(vectors, axis=1))
 
 
-def _placed(poses: np.ndarray, frame: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Points (N, 3) moved by the poses (F, 4, 4) of their frames (N,)."""
-    return np.einsum("nij,nj->ni", poses[frame, :3, :3], points) + poses[frame, :3, 3]
-
-
-def _crossings(places: np.ndarray) -> list[tuple[int, int]]:
-    """Numbers of the images of both passes of each crossing of a path (N, 2)."""
-    pairs = KDTree(places).query_pairs(2 * STEP_MM, output_type="ndarray")
-    pairs = pairs[pairs[:, 1] - pairs[:, 0] > NEAR]
-    pairs = pairs[np.argsort(pairs[:, 1])]
-    parts = np.split(pairs, 1 + np.flatnonzero(np.diff(pairs[:, 1]) > NEAR))
-    return [(int(first), int(second)) for first, second in (np.median(part, axis=0) for part in parts)]
-
-
-def _length_error(
-    points: np.ndarray, truth: np.ndarray, frame: np.ndarray, places: np.ndarray, crossing: tuple[int, int]
-) -> float:
-    """Return the rms error of lengths between points of both passes of a crossing, mm."""
-    near = np.linalg.norm(truth[:, :2] - places[list(crossing)].mean(axis=0), axis=1) < INSIDE_MM
-    rng = np.random.default_rng(0)
-    ends = [rng.choice(np.flatnonzero(near & (np.abs(frame - number) < NEAR)), PAIRS) for number in crossing]
-    lengths = [np.linalg.norm(each[ends[0]] - each[ends[1]], axis=1) for each in (points, truth)]
-    return _rms(lengths[0] - lengths[1])
-
-
 if __name__ == "__main__":
-    main()
+    App(help=__doc__, help_format="plaintext", default_command=main)()

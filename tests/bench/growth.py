@@ -1,4 +1,4 @@
-"""Growth of cost with frames, image size, samples, points and evidence images: ``python -m tests.bench.growth``.
+"""Growth of cost with frames, pixels, samples, points and evidence: ``python -m tests.bench.growth [--write]``.
 
 Measures processor time over two decades of each, fits the exponents, and draws ``docs/pictures/growth.svg``. For short
 runs, the fastest of several repetitions is used.
@@ -14,6 +14,7 @@ import numpy as np
 from cyclopts import App
 
 import uwlts
+from docs.studies.result_tables import publish, table
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import Noise, gathered, target_series
 from twin.rendering_options import Options, use_variant
@@ -176,17 +177,20 @@ def measured(folder: Path) -> Iterator[Growth]:
     yield evidence()
 
 
-def main() -> None:
-    """Measure, print and draw."""
-    found = []
+def main(*, write: bool = False) -> None:
+    """Measure and print; with `--write`, put the table into its page and draw the picture."""
+    found, rows = [], []
     with tempfile.TemporaryDirectory() as name:
         for growth in measured(Path(name)):
             found.append(growth)
             sizes = zip(growth.sizes, growth.seconds, strict=True)
             values = ", ".join(f"{size:,}: {1e3 * seconds:.4g} ms" for size, seconds in sizes)
-            ends = f"exponent {growth.exponent():.2f}, of the last two {growth.exponent(2):.2f}"
-            print(f"{growth.name} by {growth.unit}: {ends}; {values}", flush=True)
-    draw(found, PICTURE)
+            print(f"{growth.name} by {growth.unit}: {values}", flush=True)
+            by = f"{growth.unit}, {growth.sizes[0]:,} to {growth.sizes[-1]:,}"
+            rows.append([growth.name, by, f"{growth.exponent():.2f}", f"{growth.exponent(2):.2f}"])
+    publish({"growth": table(["what", "by", "exponent", "of the last two"], rows)}, write=write)
+    if write:
+        draw(found, PICTURE)
 
 
 if __name__ == "__main__":

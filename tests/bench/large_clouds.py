@@ -1,4 +1,4 @@
-"""Time and memory of commands on large clouds: ``python -m tests.bench.large_clouds``, by default 10^7 points.
+"""Time and memory of commands on large clouds: ``python -m tests.bench.large_clouds [--write]``, 10^7 points each.
 
 The clouds are two scans of a pipe with pits, made with NumPy only, in files of 24 bytes per point. Each command runs
 alone in a process of its own.
@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from cyclopts import App
 
+from docs.studies.result_tables import publish, table
 from tests.oracles.pipes import Bump, scan_pipe
 from uwlts.runtime.command_line import show
 
@@ -35,13 +36,15 @@ class Cost:
     limit_gb: float
 
 
-def main(points: int = 10_000_000) -> int:
+def main(points: int = 10_000_000, *, write: bool = False) -> int:
     """Print the cost of each command.
 
     Parameters
     ----------
     points
         Points of each cloud.
+    write
+        Put the table into its page of docs/results.
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -54,17 +57,16 @@ def main(points: int = 10_000_000) -> int:
             ("uwlts register before.ply after.ply --out both.h5", 8.0),
             ("uwlts mesh after.ply --out after-mesh.ply", 8.0),
         )
-        missed = 0
+        missed, rows = 0, []
         for line, limit_gb in commands:
             cost = _run(line, folder, limit_gb)
             kept = cost.peak_gb <= cost.limit_gb
             missed += not kept
-            show(
-                [
-                    f"{line}: {cost.seconds:.0f} s ({cost.processor_s:.0f} s of processor time), "
-                    f"{cost.peak_gb:.2f} GB{'' if kept else f', limit {cost.limit_gb:g} GB missed'}"
-                ]
-            )
+            memory = f"{cost.peak_gb:.1f} GB", f"{cost.limit_gb:g} GB{'' if kept else ', missed'}"
+            rows.append([f"`{line}`", f"{cost.processor_s:.0f} s", f"{cost.seconds:.0f} s", *memory])
+            show([" ".join(rows[-1])])
+    head = ["command", "processor time", "time", "peak memory", "limit"]
+    publish({"large clouds": table(head, rows)}, write=write)
     return 1 if missed else 0
 
 

@@ -1,4 +1,4 @@
-"""Time of laser light after faults: ``python -m tests.bench.laser_off [tries]``, 100 tries of each fault by default.
+"""Time of laser light after faults: ``python -m tests.bench.laser_off [tries] [--write]``, 100 of each by default.
 
 Runs with different ``--seed`` draw different times of the faults.
 
@@ -22,6 +22,7 @@ from pathlib import Path
 
 from cyclopts import App
 
+from docs.studies.result_tables import publish, table
 from tests.system.drawn_hardware import STAGE, DrawnCamera, write_plan
 from tests.waiting import within
 from twin.devices.grbl_controller import GrblController
@@ -129,19 +130,20 @@ def measure_light(name: str, folder: Path, *, wait_s: float) -> float:
                     os.kill(guard, signal.SIGKILL)
 
 
-def main(tries: int = 100, *, seed: int = 0) -> int:
-    """Cause each fault a number of times, at different times of the light, and print a table."""
+def main(tries: int = 100, *, seed: int = 0, write: bool = False) -> int:
+    """Cause each fault a number of times, at different times of the light; print the table or write it to its page."""
     chosen, measured = random.Random(seed), {name: [] for name in FAULTS}
     with tempfile.TemporaryDirectory() as folder:
         for _ in range(tries):
             for name, found in measured.items():
                 found.append(measure_light(name, Path(folder), wait_s=chosen.uniform(0.0, 0.2)))
                 print(f"{name}: {found[-1]:.3f} s", file=sys.stderr, flush=True)
-    print(f"exposure {EXPOSURE_MS} ms, limit {LIMIT_S:.3f} s")
-    print(f"{'fault':<30}{'tries':>6}{'median/s':>10}{'longest/s':>10}{'above':>7}")
-    for name, found in measured.items():
-        above = sum(each > LIMIT_S for each in found)
-        print(f"{name:<30}{len(found):>6}{statistics.median(found):>10.3f}{max(found):>10.3f}{above:>7}")
+    rows = [
+        [name, f"{len(found)}", f"{statistics.median(found):.2f} s", f"{max(found):.2f} s"]
+        for name, found in measured.items()
+    ]
+    head = ["fault", "tries", "median", f"longest (limit {LIMIT_S:.2f} s)"]
+    publish({"light after faults": table(head, rows)}, write=write)
     return int(any(each > LIMIT_S for found in measured.values() for each in found))
 
 

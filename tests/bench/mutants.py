@@ -27,7 +27,8 @@ from queue import SimpleQueue
 
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
+
+from docs.studies.result_tables import publish, table
 
 ROOT = Path(__file__).resolve().parents[2]
 TESTS = {
@@ -300,6 +301,7 @@ def main() -> None:
     parser.add_argument("--whole", action="store_true", help="run all fast tests of the package for each mutant")
     parser.add_argument("--again", type=Path, help="try the survivors of these results on all tests")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--write", action="store_true", help="put the table into its page of docs/results")
     parser.add_argument("--out", type=Path, default=Path("mutants.json"), help="results, written after each mutant")
     options = parser.parse_args()
     if unknown := set(options.packages) - TESTS.keys():
@@ -316,12 +318,14 @@ def main() -> None:
         ):
             results = [each for each in results if each.mutant != result.mutant] + [result]
             options.out.write_text(json.dumps([asdict(each) for each in results], indent=1))
-    table = Table("package", "mutants", "killed", "survived", "not run", "score")
-    for package in dict.fromkeys(result.mutant.package for result in results):
-        count = Counter(result.outcome for result in results if result.mutant.package == package)
+    rows = []
+    for package in [*dict.fromkeys(result.mutant.package for result in results), "together"]:
+        count = Counter(result.outcome for result in results if package in (result.mutant.package, "together"))
         numbers = [count.total(), *(count[outcome] for outcome in ("killed", "survived", "not run"))]
-        table.add_row(package, *map(str, numbers), f"{count['killed'] / count.total():.0%}")
-    console.print(table)
+        rows.append([package, *map(str, numbers), f"{count['killed'] / count.total():.0%}"])
+    publish(
+        {"mutants": table(["package", "mutants", "killed", "survived", "not run", "score"], rows)}, write=options.write
+    )
     for result in results:
         if result.outcome != "killed":
             where = f"{result.mutant.file}:{result.mutant.line} {result.outcome}"
