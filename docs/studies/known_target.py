@@ -31,7 +31,7 @@ def main(*, write: bool = False) -> None:
         variation = Variation(what, {"uncertainty": known} if known else {})
         campaigns = [Campaign(FIRST + n, wet=True, known_better=True, variation=variation) for n in range(COUNT)]
         found = [m for each in campaigns for m in run_campaign(each).measured if m.figure == SPACING]
-        std, error = (1e3 * np.sqrt(np.mean(np.square(v))) for v in zip(*((m.std_mm, m.error_mm) for m in found)))
+        std, error = (1e3 * np.sqrt(np.mean(np.square([(m.std_mm, m.error_mm) for m in found]), axis=0))).tolist()
         values = " ".join(f"{name} = {value:.3g}" for name, value in known.items())
         rows.append([what, f"`{values}`" if values else "", f"{std:.1f} µm", f"{error:.1f} µm"])
         print(rows[-1], flush=True)

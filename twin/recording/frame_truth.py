@@ -276,11 +276,9 @@ def project_points(renderer: Renderer, scene_from_object: np.ndarray, points_mm:
         at = pixels[:, None] + [(0, 0), (1, 0), (0, 1)]
         bundle = renderer.view.trace_bundle(to_jit(at[..., 0]), to_jit(at[..., 1]))
         dr.eval(bundle.origin, bundle.direction)
+        direction = to_numpy(bundle.direction).astype(float).reshape(*at.shape[:2], 3)
         # Without a window all rays have one origin.
-        origin, direction = (
-            np.broadcast_to(to_numpy(v).astype(float).reshape(-1, 3), (at[..., 0].size, 3)).reshape(*at.shape[:2], 3)
-            for v in (bundle.origin, bundle.direction)
-        )
+        origin = np.resize(to_numpy(bundle.origin).astype(float), direction.shape)
         towards = points[:, None] - origin
         miss = towards - np.sum(towards * direction, axis=2, keepdims=True) * direction
         slopes = np.stack([miss[:, 1] - miss[:, 0], miss[:, 2] - miss[:, 0]], axis=2)
