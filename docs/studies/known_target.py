@@ -1,7 +1,7 @@
 """Uncertainty of a spacing if more is known about the target: ``python -m docs.studies.known_target [--write]``.
 
 Campaigns in water are simulated by Fermat's principle and calibrated jointly, each with a target that differs from its
-description as stated. What is measured of the target is stated five times better.
+description as stated. Measured quantities of the target are stated, and drawn, five times better.
 """
 
 import numpy as np
