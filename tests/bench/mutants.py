@@ -31,30 +31,24 @@ from rich.progress import track
 from docs.studies.result_tables import publish, table
 
 ROOT = Path(__file__).resolve().parents[2]
-TESTS = {
-    "uwlts/optics": [f"tests/uwlts/{name}" for name in ("optics", "reconstruction", "calibration", "thesis")],
-    "uwlts/stripe": ["tests/uwlts/stripe", "tests/uwlts/reconstruction"],
+ALSO = {
     "uwlts/calibration/joint": ["tests/uwlts/calibration", "tests/uwlts/reconstruction"],
     "uwlts/calibration/mount": ["tests/uwlts/calibration/mount"],
-    "uwlts/calibration": [
-        f"tests/uwlts/calibration/{name}"
-        for name in ("camera", "guidance", "sequential", "polynomial", "test_target_stripes.py")
-    ],
-    "uwlts/reconstruction": ["tests/uwlts/reconstruction", "tests/uwlts/report", "tests/system/test_joint_command.py"],
-    "uwlts/fitting": [
-        f"tests/uwlts/{name}" for name in ("fitting", "evaluation", "registration", "inspection", "comparison")
-    ],
-    "uwlts/evaluation": [
-        *(f"tests/uwlts/{name}" for name in ("evaluation", "acceptance")),
-        "tests/uwlts/reconstruction/test_point_uncertainty.py",
-    ],
-    "uwlts/registration": ["tests/uwlts/registration"],
-    "uwlts/alignment": ["tests/uwlts/alignment"],
-    "uwlts/inspection": ["tests/uwlts/inspection"],
-    "uwlts/comparison": ["tests/uwlts/comparison"],
-    "twin/light": ["tests/twin/light", "tests/twin/recording"],
-    "twin/sensor": ["tests/twin/sensor", "tests/twin/light"],
-    "twin/scene": ["tests/twin/scene"],
+    "uwlts/cli": [f"tests/system/test_{name}.py" for name in ("command_lines", "command_errors", "inputs_kept")],
+    "uwlts/evaluation": ["tests/uwlts/acceptance", "tests/uwlts/reconstruction/test_point_uncertainty.py"],
+    "uwlts/fitting": [f"tests/uwlts/{name}" for name in ("shapes", "evaluation", "registration", "inspection")],
+    "uwlts/optics": [f"tests/uwlts/{name}" for name in ("reconstruction", "calibration", "thesis")],
+    "uwlts/reconstruction": ["tests/uwlts/report", "tests/system/test_joint_command.py"],
+    "uwlts/shapes": ["tests/uwlts/evaluation"],
+    "uwlts/stripe": ["tests/uwlts/reconstruction"],
+    "twin/devices": ["tests/system/test_serve.py", "tests/system/test_gige_camera.py", "tests/uwlts/hardware"],
+    "twin/light": ["tests/twin/recording"],
+    "twin/sensor": ["tests/twin/light"],
+}
+"""Tests of a package beside those of the same name."""
+PACKAGES = sorted({*ALSO, *(str(init.parent.relative_to(ROOT)) for init in ROOT.glob("[tu]w*/*/__init__.py"))})
+TESTS = {
+    name: [*([f"tests/{name}"] if (ROOT / "tests" / name).is_dir() else []), *ALSO.get(name, [])] for name in PACKAGES
 }
 """Packages, without packages within them that are listed too, and folders of the tests that run them."""
 # These change no result, or make every test fail, such as bitwise operators between floating-point numbers.
