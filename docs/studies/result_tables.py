@@ -1,6 +1,6 @@
 """Tables of docs/results: written by one command each, with date, commit and a digest of the code that they depend on.
 
-    python -m docs.studies.result_tables                # list the tables whose code has changed since
+    python -m docs.studies.result_tables [--write]      # list the tables whose code has changed since
     python -m docs.studies.result_tables --run          # make results: all tables by the code of this commit
     python -m docs.studies.result_tables --run --stale  # make results STALE=1: only those whose code has changed
 
@@ -184,13 +184,16 @@ def write_index() -> None:
     _replace("pages", "", f"{describe_measurement()}\n\n{table(head, rows)}")
 
 
-def main(*, run: bool = False, stale: bool = False) -> int:
-    """List tables; with `--run`, measure those of other commits, or with `--stale` those whose code has changed.
+def main(*, run: bool = False, stale: bool = False, write: bool = False) -> int:
+    """List old tables, or with `--write` count them in the index.
 
-    The exit status is 1 if a table was not written.
+    With `--run`, measure those of other commits, or with `--stale` those whose code has changed. The exit status is 1
+    if a table was not written.
     """
     if not run:
         list_stale()
+        if write:
+            write_index()
         return 0
     commit = "" if stale else _git("rev-parse", "--short=7", "HEAD")
     left, missed = [study for study in read_studies() if study.stale(read_blocks(), commit)], []
