@@ -3,7 +3,6 @@ from .acceptance.accept import accept as accept
 from .alignment.align import align_trajectory as align_trajectory
 from .calibration.calibrate import calibrate as calibrate
 from .calibration.camera.photographs import calibrate_camera as calibrate_camera
-from .calibration.joint.refresh import refresh as refresh
 from .calibration.mount.calibrate_mount import calibrate_mount as calibrate_mount
 from .calibration.polynomial.polynomial_calibration import calibrate_polynomials as calibrate_polynomials
 from .comparison.change import compare_clouds as compare_clouds

@@ -59,9 +59,11 @@ def lit_points(sensor: Sensor, *, normal, point, index, bow=0.0, count=200):
     return found @ module + pose.origin_mm
 
 
-def target_series(sensor, *, medium=None, window=True, positions, bow=0.0, noise=Noise(), tilts=None, columns=25):
+def target_series(
+    sensor, *, medium=None, window=True, positions, bow=0.0, noise=Noise(), tilts=None, columns=25, index=WATER
+):
     """Return a series of the target with stripes: on the stage, or in free poses with ``tilts`` (F, 2) in rad."""
-    index = 1.0 if medium is None else WATER
+    index = 1.0 if medium is None else index
     frame = camera_from_object(sensor)
     direction = frame[:3, :3] @ np.array([0.002, -0.001, 1.0])
     images, stripes = [], []

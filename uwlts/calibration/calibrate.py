@@ -1,7 +1,7 @@
 """Calibration of a sensor from its captures: the appropriate method, or the joint one from any mix."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -10,17 +10,19 @@ from pydantic import JsonValue
 from uwlts.calibration.camera.camera_parameters import CameraOptions
 from uwlts.calibration.camera.lens import Distortion, LensChoice, Pixels, require_coefficients
 from uwlts.calibration.camera.target_poses import Poses
+from uwlts.calibration.joint.earlier import join_media, merge_with_earlier, read_earlier, require_suitable
 from uwlts.calibration.joint.estimate import Estimate
 from uwlts.calibration.joint.gathering import Gathered, gather_jointly, hold_camera
-from uwlts.calibration.joint.policy import solve_consistently
+from uwlts.calibration.joint.policy import explain_by_index, solve_consistently
 from uwlts.calibration.joint.scanned_surfaces import ScannedPlane, SurfaceScanEvidence
 from uwlts.calibration.joint.stored_estimate import build_calibration
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, calibrate_sequentially
-from uwlts.errors import CalibrationError, DescriptionError
+from uwlts.errors import CalibrationError, DescriptionError, RangeError
 from uwlts.fitting.least_squares import robust_std
 from uwlts.model.calibration import Calibration, KnownStage
 from uwlts.optics.window import require_index
 from uwlts.runtime.progress import ProgressListener, ignore_progress
+from uwlts.storage.calibration_file import read_calibration
 from uwlts.storage.capture import Capture, open_captures
 from uwlts.stripe import StripeSettings
 
@@ -53,11 +55,18 @@ def calibrate_jointly(
     contradicts it; DescriptionError, CaptureError as for `gather_jointly`.
     """
     options = CalibrationOptions() if options is None else options
+    if options.earlier is not None:
+        require_suitable([*targets, *steps, *scans], options.earlier)
     return solve_jointly(gather_jointly(targets, steps, scans, options=options, progress=progress), options=options)
 
 
 def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointResult:
     """Calibrate from gathered evidence; errors as `calibrate_jointly`."""
+    earlier = options.earlier
+    if earlier is not None:
+        gathered = join_media(gathered, earlier, new=not options.same_water)
+        camera = read_earlier(earlier, gathered).parameters.intrinsics.options
+        options = replace(options, camera=camera, lens=None)
     options, off_px = hold_camera(gathered, options), dict[str, list[float]]()
     try:
         problem, result, against, changes = solve_consistently(gathered, options)
@@ -65,7 +74,7 @@ def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointRe
             for piece, parts in zip(problem.evidence, result.residuals, strict=True):
                 for part in parts:
                     off_px.setdefault(piece.sources[part.image], []).append(robust_std(part.values))
-            raise CalibrationError(against.refusal())
+            raise CalibrationError((earlier and explain_by_index(problem)) or against.refusal())
     except CalibrationError as error:
         table = "".join(series.found.table(off_px) for series in gathered.series)
         raise CalibrationError(f"{error}{table}") from error
@@ -75,9 +84,10 @@ def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointRe
         "poses": options.poses,
         "medium_index": options.medium_index,
         "known_before": sensor.uncertainty.model_dump(),
-        "target": gathered.series[0].found.target.model_dump(mode="json"),
         "warnings": [*warnings],
     }
+    for series in gathered.series[:1]:
+        provenance["target"] = series.found.target.model_dump(mode="json")
     calibration = build_calibration(result, problem.evidence, sensor, list(gathered.media.values()), provenance)
     scans = [
         e for e in problem.evidence if isinstance(e, SurfaceScanEvidence) and not isinstance(e.surface, ScannedPlane)
@@ -89,6 +99,8 @@ def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointRe
             direction=(direction @ calibration.object_transform()[:3, :3]).tolist(),
         )
         calibration = calibration.model_copy(update={"stages": (stage,)})
+    if earlier is not None:
+        calibration = merge_with_earlier(calibration, earlier)
     return JointResult(calibration, result, warnings)
 
 
@@ -107,9 +119,11 @@ def calibrate(
     strict: bool = False,
     refractions: Literal[1, 2] = 2,
     target_poses: Poses = "stage-normal",
+    earlier: Calibration | str | Path | None = None,
     distortion: Distortion = "auto",
     pixels: Pixels = "auto",
     index: float | None = None,
+    index_std: float | None = None,
     stripe: StripeSettings = None,
     progress: ProgressListener = ignore_progress,
 ) -> Calibration:
@@ -134,8 +148,12 @@ def calibrate(
     joint : bool
         Estimate all parameters together, as always with ``water`` or ``scan``. Prior knowledge and its uncertainty are
         taken from the sensor's description.
+    earlier : Calibration or path, optional
+        Joint calibration of the sensor: its estimate, with all correlations, is prior knowledge in place of the
+        description. Images of a target, of a step or a scan then suffice each, also for other water.
     new_water : bool
-        The scans were taken in other water than the target, or on another day: also estimate its index.
+        The scans were taken in other water than the target, or on another day: also estimate its index. With
+        ``earlier``, all captures were.
     unknown_sizes : bool
         Estimate diameters and spacings of scanned objects, even if their descriptions state an uncertainty.
     strict : bool
@@ -156,6 +174,9 @@ def calibrate(
         free poses, else square.
     index : float, optional
         Refractive index of the medium relative to air. Default: the index that follows from the captures.
+    index_std : float, optional
+        Joint: its standard uncertainty. Default: that of the sensor's description. Use 0.001 if little is known about
+        the water.
     stripe : StripeOptions or dict, optional
         As for `reconstruct`.
     progress : callable, optional
@@ -180,10 +201,18 @@ def calibrate(
     if index is not None:
         require_index(index)
     require_coefficients(distortion)
-    if not (air or water):
-        raise DescriptionError("no captures of a target to calibrate from: give `air` or `water`")
-    if (new_water or unknown_sizes) and not scan:
+    if index_std is not None and not index_std > 0:
+        raise RangeError(f"the standard uncertainty of the index is {index_std:g}; it must be positive")
+    if not (air or water or (earlier is not None and (step or scan))):
+        raise DescriptionError(
+            "no captures of a target to calibrate from: give `air` or `water`, or `earlier` with `step` or `scan`"
+        )
+    if not scan and (unknown_sizes or (new_water and earlier is None)):
         raise DescriptionError("`new_water` and `unknown_sizes` apply to scans: give `scan`, too")
+    if earlier is not None:
+        if (distortion, pixels) != ("auto", "auto"):
+            raise DescriptionError("`earlier` states the lens: leave out `distortion` and `pixels`")
+        earlier = earlier if isinstance(earlier, Calibration) else read_calibration(earlier)
     options = CalibrationOptions(
         refractions=refractions,
         poses=target_poses,
@@ -193,9 +222,11 @@ def calibrate(
         lens=LensChoice(distortion, pixels),
         stripe=stripe,
         medium_index=index,
+        index_std=index_std,
         same_water=not new_water,
         sizes_known=not unknown_sizes,
         strict=strict,
+        earlier=earlier,
     )
     with (
         open_captures(air) as in_air,
@@ -212,6 +243,6 @@ def calibrate(
         targets = [*in_air, *in_water]
         # The sequential calibration does not use prior knowledge of the lens.
         known = any(capture.header.sensor.uncertainty.focal_length is not None for capture in targets)
-        if joint or water or scan or known:
+        if joint or water or scan or known or earlier is not None:
             return calibrate_jointly(targets, steps, scans, options=options, progress=progress).calibration
         return calibrate_sequentially(in_air, steps, options=options, progress=progress).calibration

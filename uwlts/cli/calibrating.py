@@ -19,7 +19,6 @@ from uwlts.cli.command_options import (
     wrote_page,
 )
 from uwlts.errors import DescriptionError, OutputError
-from uwlts.files.writing import refuse_unsuitable
 from uwlts.runtime.command_line import Call, command_from, say, show, warn
 
 _EVIDENCE = ("air", "water", "step", "scan")
@@ -47,6 +46,8 @@ def calibrate(
     """Example: uwlts calibrate --air target.h5 --step step-near.h5 step-far.h5 --out calibration.json
 
     Example: uwlts calibrate --water target-water.h5 --out calibration.json
+
+    Example: uwlts calibrate --earlier calibration.json --step step-today.h5 --new-water --out today.json
     """
     from uwlts.calibration.camera.lens import require_coefficients
     from uwlts.calibration.joint.next_shot import advice_lines
@@ -118,26 +119,6 @@ def mount(
     found = call()
     found.save(out, overwrite=overwrite)
     wrote(mount_lines(found), found.weaknesses, out)
-
-
-@command_from(app, uwlts, "refresh", job="Calibrate", shortcuts=STRIPE)
-def refresh(
-    call: Call,
-    *,
-    out: Annotated[
-        Path | None, a_file(".json"), Parameter(help="Calibration to write; by default CALIBRATION.refreshed.json.")
-    ] = None,
-    overwrite: Overwrite = False,
-) -> None:
-    """Example: uwlts refresh calibration.json --step step-today.h5 --out today.json"""
-    from uwlts.calibration.joint.next_shot import advice_lines
-
-    path = out or Path(call.given["calibration"]).with_suffix(".refreshed.json")
-    refuse_unsuitable(path, overwrite=overwrite)
-    found = call()
-    found.calibration.save(path, overwrite=overwrite)
-    changes = (line for change in found.changes for line in change.lines())
-    wrote([*changes, *advice_lines(found.calibration)], found.warnings, path)
 
 
 @command_from(app, uwlts, "recalibrate", job="Calibrate", shortcuts=STRIPE)

@@ -37,11 +37,11 @@ from uwlts.hardware.scan_plan import ScanPlan, load_plan
 from uwlts.hardware.scanning import ScanProgress, open_camera, record_scan
 from uwlts.model.calibration import AnyCalibration, Calibration, rigid_transform
 from uwlts.optics.fitness import check_fits
-from uwlts.recalibration.recalibrate import recalibrate
+from uwlts.recalibration.recalibrate import KnownPasses
 from uwlts.runtime.optional_library import pip_install
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.calibration_file import load_calibration, resolve_calibration
-from uwlts.storage.capture import CAPTURES, CaptureHeader, Frame, part_path
+from uwlts.storage.capture import CAPTURES, CaptureHeader, Frame, open_capture, part_path
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.ros_messages import (
     FRAME_ID,
@@ -219,8 +219,7 @@ class PassAdvice:
         require_joint(calibration)
         if not (pose_std_mm and pose_std_deg and pose_std_mm > 0 and pose_std_deg > 0):
             raise DescriptionError("advice on passes needs `pose_std_mm` and `pose_std_deg`, both positive")
-        self._calibration, self._std_mm, self._std_deg = calibration, pose_std_mm, pose_std_deg
-        self._passes: list[tuple[Path, np.ndarray]] = []
+        self._passes = KnownPasses(calibration, pose_std_mm=pose_std_mm, pose_std_deg=pose_std_deg)
         self.pose: np.ndarray | None = None
         self.publish: Callable[[str], None] = lambda text: None
 
@@ -228,16 +227,10 @@ class PassAdvice:
         """Publish the advice after a further pass, recorded with the sensor at ``pose``."""
         if pose is None:
             raise HardwareError(f"no pose of the sensor is known for {path.name}, so that no next pass is advised")
-        self._passes.append((path, pose))
-        paths, poses = [each for each, _ in self._passes], np.array([each for _, each in self._passes])
-        found = recalibrate(
-            paths,
-            calibration=self._calibration,
-            poses=poses,
-            pose_std_mm=self._std_mm,
-            pose_std_deg=self._std_deg,
-            progress=progress,
-        )
+        with open_capture(path) as capture:
+            self._passes.add(capture, pose)
+        progress(1, 2)
+        found = self._passes.solve()
         lengths = [f"100 mm along {each.axis}: +-{each.after_mm:.3f} mm" for each in found.lengths]
         self.publish("\n".join([*lengths, *found.advice(), *found.doubts]))
 

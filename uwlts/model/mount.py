@@ -90,8 +90,10 @@ class Mount(Brief, Description):
     ``pose_std_mm`` that of each coordinate of the platform's position; both are estimated from the profiles.
 
     On a rotary table (``table``), the platform's z axis is the table's axis. Translation along it and rotation about it
-    are conventions and have zero variance. ``sensor`` contains the contribution of the sensor's calibration to the
-    covariance, if the calibration has a joint estimate. Otherwise the profiles are assumed exact apart from noise.
+    are conventions and have zero variance. ``clock_covariance`` (6,) is that of the clock's offset with the mount from
+    all sources but the sensor's calibration; without it, the offset is independent. ``sensor`` contains the
+    contribution of the sensor's calibration to the covariance, if the calibration has a joint estimate. Otherwise the
+    profiles are assumed exact apart from noise.
     ``inputs`` holds the SHA-256 of every input file. ``edited`` is set if its file was edited by hand.
     """
 
@@ -103,6 +105,7 @@ class Mount(Brief, Description):
     robot_scale_std: NotNegative | None = None
     time_offset_s: float | None = None
     time_offset_std_s: NotNegative | None = None
+    clock_covariance: tuple[float, float, float, float, float, float] | None = None
     point_std_mm: NotNegative
     pose_std_mm: NotNegative
     rms_mm: NotNegative
@@ -154,3 +157,15 @@ class Mount(Brief, Description):
         if self.sensor is None or self.sensor.calibration != calibration:
             return np.array(self.covariance), None
         return np.array(self.sensor.covariance_apart), np.array(self.sensor.by_parameters)
+
+    def clock_errors(self, root: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return the error of the clock's offset, s, by independent components (K,) of the mount's, and the remainder.
+
+        ``root`` (6, K) are the mount's errors by these components; the remainder is a standard uncertainty.
+        """
+        std, of_mount = self.time_offset_std_s or 0.0, np.linalg.norm(root, axis=1)
+        if self.clock_covariance is None or not std:
+            return np.zeros(root.shape[1]), std
+        scale = np.where(of_mount > 0, of_mount, 1.0)
+        by = np.linalg.lstsq(root / scale[:, None], np.array(self.clock_covariance) / scale / std, rcond=None)[0]
+        return std * by, std * float(np.sqrt(max(1.0 - by @ by, 0.0)))

@@ -405,6 +405,7 @@ def move_mount(mount: Mount, problem: PassProblem, solution: PassSolution, calib
     if mount.time_offset_std_s:
         changes["time_offset_s"] = (mount.time_offset_s or 0.0) + float(change[6])
         changes["time_offset_std_s"] = float(np.sqrt(of_mount[6, 6]))
+        changes["clock_covariance"] = tuple((of_mount[:6, 6] - by_parameters @ shared[6]).tolist())
     if mount.robot_scale is not None:
         scale = problem.motion.pose_scale
         changes["robot_scale"] = mount.robot_scale * (1.0 + scale * float(solution.amplitudes[count]))

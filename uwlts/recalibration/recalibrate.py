@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from uwlts.calibration.joint.observability import compute_lengths, project_sheet_points, sample_sheet
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, read_stored_estimate, require_joint
@@ -273,9 +272,6 @@ def recalibrate(
     >>> found = uwlts.recalibrate(["a.h5", "b.h5", "c.h5"], calibration="old.json", poses="passes.csv",
     ...                           pose_std_mm=0.01, pose_std_deg=0.005)
     """
-    for name, std in (("pose_std_mm", pose_std_mm), ("pose_std_deg", pose_std_deg)):
-        if not std > 0:
-            raise RangeError(f"`{name}` is {std:g}; expected a positive number")
     artefact = resolve_artefact(artefact)
     given = (
         read_poses(Path(poses), pose_format=pose_format, unit=pose_unit)[0] if isinstance(poses, str | Path) else poses
@@ -287,32 +283,84 @@ def recalibrate(
     mount = read_mount(mount) if isinstance(mount, str | Path) else mount
     if isinstance(trajectory, str | Path):
         trajectory = read_trajectory(trajectory, pose_format=pose_format, unit=pose_unit)
+    known = KnownPasses(
+        calibration,
+        pose_std_mm=pose_std_mm,
+        pose_std_deg=pose_std_deg,
+        mount=mount,
+        trajectory=trajectory,
+        stripe=stripe,
+    )
     with open_captures(passes) as scans:
-        header = _common_header(scans)
-        prior = _read_prior(calibration, header.medium)
-        gathered, warnings = list[Pass](), list[str]()
+        for scan in scans:
+            known.expect(scan)
         for number, scan in enumerate(scans):
-            own = None if given is None else given[number]
-            if mount is None and trajectory is None:
-                some, doubts = _gather(scan, scan, None, prior, own, stripe, alone=len(scans) == 1)
-            else:
-                ride = find_platform_poses(scan, trajectory, mount=mount, clock_offset_s=None)
-                some, doubts = _gather(scan, add_platform_poses(scan, ride, mount), ride.rates, prior, None, stripe)
-                doubts = [*ride.doubts, *doubts]
-            gathered += some
-            warnings += [text if scan.path.name in text else f"{scan.path.name}: {text}" for text in doubts]
+            known.add(scan, None if given is None else given[number], alone=len(scans) == 1)
             progress(number + 1, len(scans) + 1)
-        if mount is None and any(scan.header.T_platform_sensor is not None for scan in scans):
-            warnings.append("the mount counts as exact: give `mount`, or state poses whose uncertainty contains it")
-    _refuse_repeated(gathered)
-    problem = _make_problem(gathered, prior, header, mount, pose_std_mm, pose_std_deg)
-    start = problem.place(np.zeros(problem.unknowns), [np.zeros(len(each.line)) for each in gathered])
-    radius = max(find_disc_radius(start.places_mm[start.number == each]) for each in range(len(gathered)))
-    solution = solve_passes(problem, size_mm=CELL * radius, artefact=artefact)
+    found = known.solve(artefact)
     progress(len(scans) + 1, len(scans) + 1)
-    found = summarise(problem, solution, prior, header.stage_direction)
-    moved = None if mount is None else move_mount(mount, problem, solution, found.calibration)
-    return replace(found, warnings=tuple(warnings), mount=moved)
+    return found
+
+
+class KnownPasses:
+    """Passes whose stripes have been found, to be solved together; arguments as for `recalibrate`."""
+
+    def __init__(
+        self,
+        calibration: Calibration | str | Path,
+        *,
+        pose_std_mm: float,
+        pose_std_deg: float,
+        mount: Mount | None = None,
+        trajectory: Trajectory | None = None,
+        stripe: StripeSettings = None,
+    ):
+        for name, std in (("pose_std_mm", pose_std_mm), ("pose_std_deg", pose_std_deg)):
+            if not std > 0:
+                raise RangeError(f"`{name}` is {std:g}; expected a positive number")
+        self._given, self._mount, self._trajectory, self._stripe = calibration, mount, trajectory, stripe
+        self._std = pose_std_mm, pose_std_deg
+        self._first: tuple[str, CaptureHeader, Calibration] | None = None
+        self._passes, self._warnings = list[Pass](), list[str]()
+
+    def expect(self, scan: Capture) -> Calibration:
+        """Return the earlier calibration; CaptureError if a capture is of another sensor or medium than the first."""
+        if self._first is None:
+            self._first = scan.path.name, scan.header, _read_prior(self._given, scan.header.medium)
+        name, header, prior = self._first
+        if scan.header.sensor != header.sensor or scan.header.medium != header.medium:
+            raise CaptureError(f"{scan.path.name} is of another sensor or medium than {name}")
+        return prior
+
+    def add(self, scan: Capture, pose: np.ndarray | None, *, alone: bool = False) -> None:
+        """Find the stripes of a capture; ``alone`` it needs no pose. Errors as `recalibrate`."""
+        prior = self.expect(scan)
+        if self._mount is None and self._trajectory is None:
+            found, doubts = _gather(scan, scan, None, prior, pose, self._stripe, alone=alone)
+        else:
+            ride = find_platform_poses(scan, self._trajectory, mount=self._mount, clock_offset_s=None)
+            posed = add_platform_poses(scan, ride, self._mount)
+            found, doubts = _gather(scan, posed, ride.rates, prior, None, self._stripe)
+            doubts = [*ride.doubts, *doubts]
+        _refuse_repeated([*self._passes, *found])
+        self._passes += found
+        self._warnings += [text if scan.path.name in text else f"{scan.path.name}: {text}" for text in doubts]
+        exact = "the mount counts as exact: give `mount`, or state poses whose uncertainty contains it"
+        if self._mount is None and scan.header.T_platform_sensor is not None and exact not in self._warnings:
+            self._warnings.append(exact)
+
+    def solve(self, artefact: Artefact | None = None) -> Recalibrated:
+        """Return the calibration by all passes so far, with advice; errors as `recalibrate`."""
+        if self._first is None:
+            raise CaptureError("no passes are given; a recalibration needs two or more")
+        _, header, prior = self._first
+        problem = _make_problem(self._passes, prior, header, self._mount, *self._std)
+        start = problem.place(np.zeros(problem.unknowns), [np.zeros(len(each.line)) for each in self._passes])
+        radius = max(find_disc_radius(start.places_mm[start.number == each]) for each in range(len(self._passes)))
+        solution = solve_passes(problem, size_mm=CELL * radius, artefact=artefact)
+        found = summarise(problem, solution, prior, header)
+        moved = None if self._mount is None else move_mount(self._mount, problem, solution, found.calibration)
+        return replace(found, warnings=tuple(self._warnings), mount=moved)
 
 
 def _read_prior(given: Calibration | str | Path, medium: Medium) -> Calibration:
@@ -324,17 +372,6 @@ def _read_prior(given: Calibration | str | Path, medium: Medium) -> Calibration:
         prior = as_built(load_sensor(given), medium) if built else read_calibration(given)
     require_joint(prior)
     return prior
-
-
-def _common_header(scans: Sequence[Capture]) -> CaptureHeader:
-    """Return the header of the first capture; CaptureError if another one is of another sensor or medium."""
-    if not scans:
-        raise CaptureError("no passes are given; a recalibration needs two or more")
-    header = scans[0].header
-    for scan in scans[1:]:
-        if scan.header.sensor != header.sensor or scan.header.medium != header.medium:
-            raise CaptureError(f"{scan.path.name} is of another sensor or medium than {scans[0].path.name}")
-    return header
 
 
 def _refuse_repeated(passes: Sequence[Pass]) -> None:
@@ -439,7 +476,9 @@ def _add_mount(
     A mount that was estimated with the same calibration has a part of its errors in common with it.
     """
     apart, common = mount.independent_covariance(calibration_digest(prior))
-    own = block_diag(CovarianceRoot.from_covariance(apart).root, mount.time_offset_std_s or 0.0)
+    of_mount = CovarianceRoot.from_covariance(apart).root
+    by_mount, alone = mount.clock_errors(of_mount)
+    own = np.block([[of_mount, np.zeros((6, 1))], [by_mount, np.array(alone)]])
     by = np.zeros((7, root.shape[1]))
     if common is not None:
         by[:6] = common @ root[: common.shape[1]]
@@ -449,10 +488,8 @@ def _add_mount(
     return (np.insert(root, at, 0.0, axis=1), np.insert(by_stage, at, 0.0, axis=0), MountErrors(mount.transform(), by))
 
 
-def summarise(
-    problem: PassProblem, solution: PassSolution, prior: Calibration, described: tuple[float, float, float]
-) -> Recalibrated:
-    """Return the result of a solution; ``described`` is the described direction of the stage."""
+def summarise(problem: PassProblem, solution: PassSolution, prior: Calibration, header: CaptureHeader) -> Recalibrated:
+    """Return the result of a solution for passes with a common header."""
     moved = problem.moved(solution.amplitudes)
     parts = problem.root.shape[1]
     covariance = solution.covariance[:parts, :parts]
@@ -471,7 +508,7 @@ def summarise(
     )
     return Recalibrated(
         tuple(each.name for each in problem.passes),
-        _build(problem, solution, moved, of_parameters, prior, described),
+        _build(problem, solution, moved, of_parameters, prior, header),
         lengths,
         changes,
         solution.spread,
@@ -570,20 +607,23 @@ def _build(
     moved: StoredEstimate,
     covariance: np.ndarray,
     prior: Calibration,
-    described: tuple[float, float, float],
+    header: CaptureHeader,
 ) -> Calibration:
     """Return the new calibration; the medium of the passes has the index found, with its covariance."""
     joint, keys = require_joint(prior), moved.parameters.keys
     old = dict(zip(joint.parameters, joint.std_before, strict=True))
+    before = np.sqrt(np.diag(problem.root @ problem.root.T))
     index = moved.parameters.medium_index(moved.values, moved.view)
     media = list(prior.media)
     number = moved.view.medium
-    if number is not None and number < len(media):
-        media[number] = KnownMedium(medium=media[number].medium, index=index)
+    if number is not None:
+        media[number : number + 1] = [KnownMedium(medium=header.medium, index=index)]
     way = problem.stage_direction(solution.amplitudes)
     way = tuple((way / np.linalg.norm(way)).tolist())
     stages = tuple(
-        KnownStage(described=each.described, direction=way) if np.allclose(each.described, described) else each
+        KnownStage(described=each.described, direction=way)
+        if np.allclose(each.described, header.stage_direction)
+        else each
         for each in prior.stages
     )
     estimate = joint.model_copy(
@@ -591,7 +631,7 @@ def _build(
             "parameters": keys,
             "values": tuple(moved.values.tolist()),
             "std": tuple(np.sqrt(np.diag(covariance)).tolist()),
-            "std_before": tuple(old.get(key) for key in keys),
+            "std_before": tuple(old.get(key, float(std)) for key, std in zip(keys, before, strict=True)),
             "covariance": tuple(map(tuple, covariance.tolist())),
         }
     )

@@ -145,11 +145,14 @@ def add_platform_uncertainty(
     count, shared = len(uncertainty.patterns_mm), dict(uncertainty.shared)
     if mount is not None:
         own = np.array(mount.covariance) if mount_covariance is None else mount_covariance
-        errors.append(_mount_errors(ride.poses, mount.transform()[:3, 3], own))
+        root = CovarianceRoot.from_covariance(own).root
+        errors.append(_mount_errors(ride.poses, mount.transform()[:3, 3], root))
         digest = sha256(mount.transform().tobytes() + own.tobytes()).hexdigest()[:16]
         shared[f"mount {digest}"] = np.eye(count + 6, 6, -count)
         if ride.rates is not None and mount.time_offset_std_s:
-            errors.append(ride.rates[:, :, None] * mount.time_offset_std_s)
+            by_mount, alone = mount.clock_errors(root)
+            errors[0] = errors[0] + ride.rates[:, :, None] * by_mount
+            errors.append(ride.rates[:, :, None] * alone)
     if ride.covariance is not None:
         left = ride.covariance
         if correlation_s is None and ride.rates is None:
@@ -171,13 +174,12 @@ def add_platform_uncertainty(
     return replace(uncertainty, patterns_mm=patterns, poses_mm=poses_mm, shared=shared)
 
 
-def _mount_errors(poses: np.ndarray, place_mm: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return errors (F, 6, 6) of poses (F, 4, 4) that are equivalent to independent components of the mount's error.
+def _mount_errors(poses: np.ndarray, place_mm: np.ndarray, root: np.ndarray) -> np.ndarray:
+    """Return errors (F, 6, K) of poses (F, 4, 4) that are equivalent to those of the mount by components, (6, K).
 
     A translation d and a rotation w of the mount move a point p by d + w x (p - t), all in the platform's frame. The
     sensor's position t is ``place_mm`` (3,).
     """
-    root = CovarianceRoot.from_covariance(covariance).root
     turns, shifts = poses[:, :3, :3] @ root[3:], poses[:, :3, :3] @ root[:3]
     return np.concatenate([shifts - np.cross(turns, (poses[:, :3, :3] @ place_mm)[:, :, None], axis=1), turns], axis=1)
 

@@ -122,7 +122,7 @@ def solve(seed):
     """Return the true change (7,), the problem, its solution, the new calibration and the new mount."""
     true, problem = campaign(seed)
     solution = solve_passes(problem, size_mm=9.0)
-    found = summarise(problem, solution, problem.known.calibration, (1.0, 0.0, 0.0))
+    found = summarise(problem, solution, problem.known.calibration, HEADER)
     assert not found.doubts
     return true, problem, solution, found, move_mount(MOUNT, problem, solution, found.calibration)
 
@@ -144,19 +144,24 @@ def test_mount_and_clock_are_found_with_the_sensor():
     assert (moved.after[[0, 1, 3, 4, 5, 6]] < 0.5 * moved.before[[0, 1, 3, 4, 5, 6]]).all()
     assert all(each.after_mm < 0.05 for each in found.lengths)
     assert moved.mount.time_offset_s == pytest.approx(0.2 + moved.change[6])
-    # A mount's file states no correlation with the clock.
-    problem = replace(problem, passes=[replace(each, rates=None) for each in problem.passes])
     later, count = continue_with(problem, found, moved), problem.root.shape[1]
     none = [np.zeros(len(each.line)) for each in problem.passes]
-    before = problem.place(solution.amplitudes * (np.arange(problem.unknowns) < count), none)
-    after = later.place(np.zeros(later.unknowns), none)
-    assert np.abs(after.places_mm - before.places_mm).max() < 1e-3
-    some = slice(None, None, 997)
-    stated = before.by_unknowns[some, :, :count] @ np.linalg.cholesky(solution.covariance[:count, :count])
-    # The first component is the drift of the water since the calibration.
-    given = after.by_unknowns[some, :, 1 : later.root.shape[1]]
-    stated, given = (np.sqrt(np.einsum("niu,niu->ni", each, each)) for each in (stated, given))
-    assert given == pytest.approx(stated, rel=1e-3)
+
+    def placed(problem, amplitudes, speed):
+        passes = [replace(each, rates=None if speed is None else speed * each.rates) for each in problem.passes]
+        return replace(problem, passes=passes).place(amplitudes, none)
+
+    # The clock's correlation with the calibration is left out: without that with the mount, 0.72 to 3.6 times.
+    for speed, limits in ((None, (0.999, 1.001)), (1.0, (0.95, 1.4)), (-1.0, (0.95, 1.4))):
+        before = placed(problem, solution.amplitudes * (np.arange(problem.unknowns) < count), speed)
+        after = placed(later, np.zeros(later.unknowns), speed)
+        assert speed is not None or np.abs(after.places_mm - before.places_mm).max() < 1e-3
+        some = slice(None, None, 997)
+        stated = before.by_unknowns[some, :, :count] @ np.linalg.cholesky(solution.covariance[:count, :count])
+        # The first component is the drift of the water since the calibration.
+        given = after.by_unknowns[some, :, 1 : later.root.shape[1]]
+        stated, given = (np.sqrt(np.einsum("niu,niu->ni", each, each)) for each in (stated, given))
+        assert limits[0] < (given / stated).min() and (given / stated).max() < limits[1]
 
 
 def write_scans(folder, problem):

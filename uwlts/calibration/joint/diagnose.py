@@ -84,7 +84,7 @@ _WAVES_DOUBTFUL = 8.0
 """Correlated lines for a doubt: the filter that finds the stripe, and speckle, correlate 2 to 4."""
 _WAVES_WRONG = 20.0  # correlated lines from which the model is incomplete
 _OUTLIER_SHARE = 0.2  # fraction of outliers above which the images contain another structure
-_DOUBTFUL = 4.0
+DOUBTFUL = 4.0
 """Standard uncertainties from the prior value for a doubt: one normal error in 16,000 is larger."""
 _WRONG = 6.0
 """The same for a contradiction: design values are rough, so that smaller deviations are only doubts."""
@@ -217,7 +217,7 @@ class Deviation:
         return format_deviation(self.key, self.alone, self.known, self.std, sigmas=self.sigmas)
 
 
-def deviations(result: Estimate, *, least: float = _DOUBTFUL) -> list[Deviation]:
+def deviations(result: Estimate, *, least: float = DOUBTFUL) -> list[Deviation]:
     """Return parameters that deviate from prior knowledge by at least ``least`` standard uncertainties, sorted.
 
     The stripe's shift on the target is excluded: images have little information on it, so that small model errors
@@ -309,7 +309,7 @@ class SizeDeviation:
 
     def doubtful(self) -> bool:
         """Return whether a warning is due; without a stated uncertainty, only for large deviations."""
-        return self.sigmas() > _DOUBTFUL and (self.known() or abs(self.off_mm) > _ROUGH_SIZE * self.described_mm)
+        return self.sigmas() > DOUBTFUL and (self.known() or abs(self.off_mm) > _ROUGH_SIZE * self.described_mm)
 
     def words(self) -> str:
         """Describe the deviation and what to check."""
@@ -363,15 +363,15 @@ def _check_earlier(result: Estimate) -> _Found:
     gained = before**2 - np.diag(result.covariance)[:count]
     sigmas = np.abs(result.values[:count] - earlier.values) / np.sqrt(np.maximum(gained, (0.1 * before) ** 2))
     worst = int(np.argmax(sigmas))
-    if sigmas[worst] > _DOUBTFUL:
+    if sigmas[worst] > DOUBTFUL:
         quantity = result.parameters.keys[worst].quantity
         value, known, std = (float(each[worst]) for each in (result.values, earlier.values, before))
         yield (
             bool(sigmas[worst] > _WRONG),
             f"the new images contradict the earlier calibration by {sigmas[worst]:.1f} standard uncertainties, mostly "
             f"in the {quantity.words}: {quantity.format_value(value, std)} instead of "
-            f"{quantity.format_with_std(known, std)}: check heights and media in the captures; if they are right, the "
-            "sensor has changed: calibrate again",
+            f"{quantity.format_with_std(known, std)}: check heights and media in the captures, and whether the water "
+            "is another (`new_water`); if they are right, the sensor has changed: calibrate again",
         )
 
 

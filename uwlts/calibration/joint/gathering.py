@@ -238,7 +238,7 @@ def build_priors(
         priors |= window_priors(window, known)
     for (name, medium), index in zip(gathered.media.items(), gathered.indices(options), strict=True):
         std = medium.index_uncertainty(sensor.laser.wavelength_nm, known)
-        priors[MediumIndex(name)] = Prior(index, known.index if options.medium_index else std)
+        priors[MediumIndex(name)] = Prior(index, options.index_std or (known.index if options.medium_index else std))
     if known.focal_length == 0:
         described = CameraModel.from_description(sensor.camera)
         of_px = dict.fromkeys(DISTORTION, HELD)
@@ -272,7 +272,7 @@ def hold_camera(gathered: Gathered, options: CalibrationOptions) -> CalibrationO
     Raises DescriptionError if the options state what to estimate of it; CalibrationError without a window in a medium,
     which changes the lens.
     """
-    if gathered.sensor.uncertainty.focal_length != 0:
+    if gathered.sensor.uncertainty.focal_length != 0 or options.earlier is not None:
         return options
     if options.lens not in (None, LensChoice()):
         raise DescriptionError("uncertainty.focal_length = 0 holds the camera: leave out `distortion` and `pixels`")

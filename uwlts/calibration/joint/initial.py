@@ -29,6 +29,7 @@ from uwlts.calibration.joint.scanned_surfaces import (
     SurfaceScanEvidence,
     perpendicular_directions,
 )
+from uwlts.calibration.joint.stored_estimate import StoredEstimate
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.calibration.sequential.sheet_fit import fit_sheet, object_frame
 from uwlts.calibration.sequential.step_images import label_steps
@@ -129,13 +130,15 @@ def estimate_series_start(
     indices: Sequence[float],
     *,
     options: CalibrationOptions,
+    earlier: StoredEstimate | None = None,
 ) -> SeriesStart:
     """Estimate the camera from the series with the least influence of the window, then all poses and stripes.
 
     The window has the distance d, thickness t and index g; the medium has the index n. In the paraxial approximation,
     they act like a pinhole at d + t - n (d + t / g) on the axis, with n times the focal length.
 
-    ``series`` are target images of each medium, with or without window; indices are relative to air.
+    ``series`` are target images of each medium, with or without window; indices are relative to air. An
+    ``earlier`` estimate states the camera.
 
     Raises CalibrationError if a camera without a window in air does not approximately fit the images, or they are
     rotated or mirrored against the stage.
@@ -145,7 +148,10 @@ def estimate_series_start(
     tangential = tuple(key.text for key in list_added_tangential(camera, sensor.uncertainty))
     extended = replace(camera, distortion=(*camera.distortion, *tangential))
     intrinsics = Intrinsics(extended, width_px=width_px, height_px=height_px)
-    if sensor.uncertainty.focal_length == 0:
+    if earlier is not None:
+        intrinsics = earlier.parameters.intrinsics
+        lens = earlier.values[: len(intrinsics.names)]
+    elif sensor.uncertainty.focal_length == 0:
         lens = intrinsics.from_model(CameraModel.from_description(sensor.camera))
     else:
         base = min(series, key=lambda s: (s.view.medium is not None, s.view.window, -len(s.found.images)))

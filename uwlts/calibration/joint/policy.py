@@ -10,6 +10,7 @@ import numpy as np
 from uwlts.calibration.camera.camera_parameters import CameraOptions
 from uwlts.calibration.camera.lens import DISTORTIONS, HALVES_APART, RATIONAL, compare_models, select_model
 from uwlts.calibration.joint.diagnose import (
+    DOUBTFUL,
     NOTICED,
     Deviation,
     Findings,
@@ -18,8 +19,9 @@ from uwlts.calibration.joint.diagnose import (
     compute_size_deviations,
     describe_wrong_sizes,
     deviations,
+    format_deviation,
 )
-from uwlts.calibration.joint.estimate import Estimate, Evidence
+from uwlts.calibration.joint.estimate import Estimate, Evidence, prior_observations
 from uwlts.calibration.joint.gathering import Gathered
 from uwlts.calibration.joint.initial import find_odd_images
 from uwlts.calibration.joint.parameters import Parameters
@@ -36,7 +38,8 @@ from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.calibration.target_stripes import doubt_sheet_at_rest
 from uwlts.errors import CalibrationError
-from uwlts.model.parameter_keys import LensParameter, ParameterKey, TargetParameter
+from uwlts.fitting.schur_least_squares import normal_equations
+from uwlts.model.parameter_keys import LensParameter, MediumIndex, ParameterKey, TargetParameter
 
 _LEAST_GAIN = 0.0
 """Relative gain of a coefficient in predicted mean squares: any that is significant, since the uncertainties of other
@@ -46,6 +49,7 @@ _MOST_WIDENED = 10.0
 """Largest factor of a target's stated uncertainty for its observed form or size; more is another target."""
 _NOT_BELIEVED = "it is not believed"
 _MOST_HALVES = 3  # parameters whose halves disagree that a message names
+_ANY_INDEX = 0.02  # standard uncertainty of the index of an unknown liquid
 
 
 def solve_consistently(
@@ -99,6 +103,23 @@ def solve_and_check(problem: JointProblem) -> tuple[Estimate, Findings]:
     if alone:
         against = replace(against, contradictions=wrong + against.contradictions)
     return result, against
+
+
+def explain_by_index(problem: JointProblem) -> str:
+    """Describe an index of new media that makes evidence agree with an earlier calibration, or return an empty text."""
+    priors = problem.parameters.priors
+    new = [key for key in problem.parameters.keys if isinstance(key, MediumIndex) and np.isfinite(priors[key].std)]
+    free = {key: replace(priors[key], std=_ANY_INDEX) for key in new}
+    result, against = solve_and_check(replace(problem, parameters=replace(problem.parameters, priors=priors | free)))
+    if against.all_against():
+        return ""
+    found, std = dict(zip(result.parameters.keys, result.values.tolist(), strict=True)), result.std()
+    off = {key: abs(found[key] - priors[key].mean) / float(np.hypot(std[key], priors[key].std)) for key in new}
+    return "; ".join(
+        format_deviation(key, found[key], priors[key].mean, priors[key].std, sigmas=sigmas)
+        for key, sigmas in off.items()
+        if sigmas >= DOUBTFUL
+    )
 
 
 @dataclass(frozen=True)
@@ -208,8 +229,8 @@ def _compare_halves_of_form(problem: JointProblem, near: Estimate) -> list[HalfD
             found.append(problem.with_images(half, near).solve())
     if len(found) < 2:
         return None
-    std = problem.parameters.prior_std()
-    shared = np.diag(np.where(np.isfinite(std), std, np.inf) ** -2.0)
+    count = len(near.values)
+    shared = normal_equations(prior_observations(problem.parameters, near.values), count, 0)[0][:count, :count]
     values, covariances = [each.values for each in found], [each.covariance for each in found]
     halves = compare_estimates(problem.parameters.keys, values, covariances, shared)
     return [h for h in halves if isinstance(h.key, TargetParameter) and h.sigmas() > HALVES_APART]

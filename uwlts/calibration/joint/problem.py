@@ -11,6 +11,7 @@ from typing import Self
 import numpy as np
 
 from uwlts.calibration.camera.camera_parameters import CameraOptions
+from uwlts.calibration.joint.earlier import read_earlier
 from uwlts.calibration.joint.estimate import Estimate, Evidence, Noise, estimate, outliers, prior_observations
 from uwlts.calibration.joint.gathering import Gathered, build_priors, usual_distortion
 from uwlts.calibration.joint.initial import (
@@ -19,7 +20,7 @@ from uwlts.calibration.joint.initial import (
     estimate_line_start,
     estimate_series_start,
 )
-from uwlts.calibration.joint.parameters import Parameters, Prior
+from uwlts.calibration.joint.parameters import SHEET, EarlierEstimate, Parameters, Prior
 from uwlts.calibration.joint.residuals import TARGET, Residuals, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
@@ -126,7 +127,8 @@ def joint_problem(gathered: Gathered, *, options: CalibrationOptions) -> JointPr
     """Build the problem from the captures, with start values; errors as `calibrate_jointly`."""
     sensor = gathered.sensor
     views = [part.view for part in (*gathered.series, *gathered.scans)] + [view for _, view in gathered.steps]
-    if not gathered.series:
+    earlier = None if options.earlier is None else read_earlier(options.earlier, gathered)
+    if not gathered.series and earlier is None:
         raise CalibrationError("no capture shows a target; joint calibration needs one in air or in water")
     bare = next((v.medium for v in views if v.medium is not None and not v.window and set(views) != {v}), None)
     if bare is not None:
@@ -135,31 +137,42 @@ def joint_problem(gathered: Gathered, *, options: CalibrationOptions) -> JointPr
             "contact with the medium has other parameters; calibrate it separately, or set window.mounted"
         )
     window = None
-    if any(view.window for view in views):
+    if earlier is not None:
+        window = earlier.calibration.window
+    elif any(view.window for view in views):
         window = WindowModel.from_description(sensor.camera.window, sensor.laser.wavelength_nm)
     indices = gathered.indices(options)
-    start = estimate_series_start(gathered.series, sensor, window, indices, options=options)
-    found = start.sheet()
-    if found is None:
+    start = estimate_series_start(gathered.series, sensor, window, indices, options=options, earlier=earlier)
+    if earlier is not None:
+        first, sheet = earlier.calibration, earlier.parameters.sheet
+        turns = np.array([earlier.parameters.value(earlier.values, key) for key in SHEET[:3]])
+    elif (found := start.sheet()) is not None:
+        sheet, turns = found
+        first = start.calibration(sheet.model(np.append(turns, (0.0, 0.0))))
+    else:
         reasons = [each.found.no_stripe for each in gathered.series if each.found.no_stripe]
         raise CalibrationError(
             "; ".join(reasons) or "no stripe was found on the target: check its description and the stage positions"
         )
-    sheet, turns = found
-    first = start.calibration(sheet.model(np.append(turns, (0.0, 0.0))))
     steps, heights, left_out = build_step_evidence(gathered, first, window)
     scans, missed = build_all_scan_evidence(gathered.scans, first, sensor, indices, sizes_known=options.sizes_known)
-    priors = build_priors(gathered, window, turns, heights, options)
-    parameters = Parameters(start.intrinsics, sheet, window, tuple(gathered.media), priors)
+    if not (start.evidence or steps or scans):
+        raise CalibrationError("; ".join([*gathered.warnings, *left_out, *missed]))
+    priors, known = build_priors(gathered, window, turns, heights, options), None
+    if earlier is not None:
+        known = EarlierEstimate(earlier.values, earlier.covariance)
+        priors = earlier.parameters.priors | {k: p for k, p in priors.items() if k not in earlier.parameters.priors}
+    parameters = Parameters(start.intrinsics, sheet, window, tuple(gathered.media), priors, known)
     global_values = parameters.start(start.lens)
     lines = [estimate_line_start(step, parameters, global_values) for step in steps]
+    circles = [series.found.target.circle_diameter_mm for series in gathered.series]
     return JointProblem(
         parameters,
         evidence=[*start.evidence, *steps, *(evidence for evidence, _ in scans)],
         global_values=global_values,
         local=[*start.local, *lines, *(local for _, local in scans)],
         sensor=sensor,
-        diameter_mm=gathered.series[0].found.target.circle_diameter_mm if options.correct_circles else None,
+        diameter_mm=circles[0] if circles and options.correct_circles else None,
         warnings=[*gathered.warnings, *left_out, *missed],
     )
 

@@ -1,8 +1,9 @@
 """Joint estimate in a calibration: written with a summary of its evidence, and read for any medium."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain, count
 
 import numpy as np
 from pydantic import JsonValue
@@ -180,6 +181,12 @@ class StoredEstimate:
         return 1 if self.calibration.stripe_along == "width" else 0
 
 
+def unused_name(name: str, taken: Collection[str]) -> str:
+    """Return the name of a new medium, with a number if another has it."""
+    names = chain([name], (f"{name} {number}" for number in count(2)))
+    return next(each for each in names if each not in taken)
+
+
 def append_independent(covariance: np.ndarray, std: Sequence[float]) -> np.ndarray:
     """Extend a covariance (P, P) by independent quantities with these standard uncertainties."""
     return np.pad(covariance, (0, len(std))) + np.diag([*[0.0] * len(covariance), *np.square(std)])
@@ -232,7 +239,7 @@ def _read_estimate(
         covariance[place, place] += drift**2
     elif medium.kind != "air":
         seen_in = len(media)
-        media.append("the scan")
+        media.append(unused_name("the scan", media))
         keys.append(MediumIndex(media[-1]))
         values = np.append(values, calibration.medium_index(medium))
         covariance = append_independent(covariance, [medium.index_uncertainty(calibration.wavelength_nm, uncertainty)])

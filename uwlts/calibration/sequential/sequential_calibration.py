@@ -67,13 +67,14 @@ class CalibrationOptions:
     lens : in place of ``camera``: select the lens model from the images, and reject outlier points and images. The
         joint calibration takes only coefficients from it
     correct_circles : correct the offset between a circle's image and the image of its centre
-    medium_index : replaces the index of the medium of the step images
-    same_water : jointly: whether scans were taken in the same water as the target, not only in water with the same
-        description
+    medium_index, index_std : replace the index of the medium of the step images, and its standard uncertainty
+    same_water : jointly: whether captures were taken in the same water as the earlier calibration, and scans in that of
+        the target, if they describe it equally
     sizes_known : jointly: whether diameters and spacings of scanned objects are known if their uncertainty is stated;
         otherwise they are estimated
     strict : jointly: raise an error for images that do not fit, instead of rejecting them or stating an error of the
         model
+    earlier : jointly: calibration whose estimate is prior knowledge
     """
 
     refractions: Literal[1, 2] = 2
@@ -83,9 +84,11 @@ class CalibrationOptions:
     stripe: StripeSettings = None
     correct_circles: bool = True
     medium_index: float | None = None
+    index_std: float | None = None
     same_water: bool = True
     sizes_known: bool = True
     strict: bool = False
+    earlier: Calibration | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,6 @@ from uwlts.calibration.joint.diagnose import Findings, PriorDeviations, check_co
 from uwlts.calibration.joint.estimate import UNSETTLED, Estimate, Noise
 from uwlts.calibration.joint.initial import estimate_series_start
 from uwlts.calibration.joint.parameters import DescribedSheet, EarlierEstimate, Parameters, Prior, ViewMedium
-from uwlts.calibration.joint.refresh import LengthChange, WaterChange
 from uwlts.calibration.joint.residuals import STRIPE, TARGET, Residuals
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.model.parameter_keys import SheetParameter, StageParameter, StepHeight, WindowParameter
@@ -232,17 +231,3 @@ def test_a_step_that_seems_too_high_may_not_face_the_laser():
 def test_a_stage_scale_is_told_in_mm_per_mm():
     said = format_deviation(StageParameter.SCALE, -0.0012, 0.0, 1e-4, sigmas=12.0)
     assert said.startswith("the stage moves 0.9988 mm per mm of its positions, stated 1 +- 0.0001 (12.0 standard")
-
-
-@pytest.mark.parametrize(("longer_mm", "word"), [(0.0123, "longer"), (-0.0123, "shorter")])
-def test_a_refresh_tells_expanded_uncertainties_before_and_after(longer_mm, word):
-    length = LengthChange(length_mm=247.3, before_mm=0.185, after_mm=0.0312, longer_mm=longer_mm)
-    index, said = WaterChange("water 2", 1.33122, 0.00032, 1.3325, 0.00011, length).lines()
-    assert index == (
-        "index of water 2: 1.33122 ± 0.00032 before, 1.33250 ± 0.00011 from the step (standard uncertainties)"
-    )
-    assert said == (
-        "least certain length, 247 mm: ± 0.3700 mm before, ± 0.0624 mm now (k = 2, from the calibration); its measured "
-        f"value is 0.0123 mm {word}"
-    )
-    assert len(WaterChange("water 2", 1.33, 1e-4, 1.33, 1e-4, None).lines()) == 1

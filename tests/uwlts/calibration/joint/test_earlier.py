@@ -1,4 +1,4 @@
-"""Adaptation of a joint calibration to new water by steps: views by Fermat's principle, captures of drawn stripes."""
+"""An earlier calibration as prior knowledge: views by Fermat's principle, captures of drawn stripes."""
 
 import json
 import re
@@ -13,17 +13,17 @@ from tests.uwlts import drawn_stripes
 from tests.uwlts.calibration_views import STEP_MM, built_sensor
 from tests.uwlts.joint_views import Noise, gathered, lit_points, seen, target_series
 from tests.virtual_sensors import with_fine_target
-from uwlts.calibration.calibrate import solve_jointly
+from uwlts.calibration.calibrate import calibrate, solve_jointly
 from uwlts.calibration.capture_evidence import StepEvidence
 from uwlts.calibration.joint.estimate import estimate
 from uwlts.calibration.joint.observability import compute_mesh_lengths, list_regions, read_region_estimate
 from uwlts.calibration.joint.parameters import EarlierEstimate, Prior, ViewMedium
-from uwlts.calibration.joint.refresh import refresh, solve_refreshed
 from uwlts.calibration.joint.residuals import StepProfileEvidence
 from uwlts.calibration.joint.stored_estimate import read_original_estimate, read_stored_estimate
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError, DescriptionError, RangeError
 from uwlts.model.artefacts import StepStandard
+from uwlts.model.calibration import calibration_digest
 from uwlts.model.parameter_keys import MediumIndex, SheetParameter, StepHeight, parse_parameter
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Medium
@@ -86,7 +86,22 @@ def steps(thesis, *, index=INDEX, depths_mm=(15.0,), medium=WARM, height_mm=STEP
 
 
 def refreshed(earlier, evidence, **options):
-    return solve_refreshed(earlier, evidence, options=CalibrationOptions(), **options)
+    """Calibrate from images in new water."""
+    options = CalibrationOptions(earlier=earlier, same_water=False, **options)
+    return solve_jointly(evidence, options=options)
+
+
+def index_in(calibration, name="water 2"):
+    """Return index and standard uncertainty of a medium."""
+    place = [key for key in calibration.joint.parameters if isinstance(key, MediumIndex)].index(MediumIndex(name))
+    return calibration.media[place].index, calibration.joint.std_of(MediumIndex(name))
+
+
+def largest_length_std(calibration):
+    """Return the largest standard uncertainty of a length in the water of use, mm."""
+    region = list_regions(calibration)[0]
+    known = read_region_estimate(calibration, region)
+    return compute_mesh_lengths(known, region).std_mm(known.covariance).max()
 
 
 def length_error(calibration):
@@ -105,18 +120,26 @@ def test_one_step_gives_the_index_of_colder_water(earlier, thesis):
     4e-4.
     """
     result = refreshed(earlier, steps(thesis), index_std=POORLY_KNOWN)
-    change = result.changes[0]
-    assert change.index_before == pytest.approx(WARM.refractive_index(WAVELENGTH), abs=1e-12)
-    assert change.std_before == POORLY_KNOWN
-    assert change.std < 0.6 * POORLY_KNOWN
-    assert abs(change.index - INDEX) < 3 * change.std
-    assert change.length.after_mm < 0.6 * change.length.before_mm
-    assert result.warnings == []
     calibration = result.calibration
+    index, std = index_in(calibration)
+    assert calibration.joint.std_before[-2] == POORLY_KNOWN
+    assert std < 0.6 * POORLY_KNOWN
+    assert abs(index - INDEX) < 3 * std
+    assert result.warnings == []
     assert [known.medium for known in calibration.media] == [WARM, WARM]
-    assert calibration.medium_index(WARM) == change.index
+    assert calibration.medium_index(WARM) == index
     assert calibration.media[0].index == pytest.approx(earlier.media[0].index, abs=1e-4)
-    assert change.name == "water 2"
+
+
+def test_water_that_is_described_alike_is_the_same_unless_it_is_new(earlier, thesis):
+    """Steps in the water of the target: its index moves within the drift, and no other appears."""
+    options = CalibrationOptions(earlier=earlier)
+    result = solve_jointly(steps(thesis, index=WARM.refractive_index(WAVELENGTH)), options=options)
+    assert [known.medium for known in result.calibration.media] == [WARM]
+    index, std = index_in(result.calibration, "water")
+    assert abs(index - WARM.refractive_index(WAVELENGTH)) < 3 * std
+    with pytest.raises(CalibrationError, match=r"whether the water is another \(`new_water`\)"):
+        solve_jointly(steps(thesis, index=1.3385), options=options)
 
 
 def test_water_whose_steps_are_left_out_is_not_said_to_be_measured(earlier, thesis):
@@ -127,15 +150,16 @@ def test_water_whose_steps_are_left_out_is_not_said_to_be_measured(earlier, thes
         evidence, media=evidence.media | {"pool": COLD}, steps=[*evidence.steps, (flat, ViewMedium(True, 1))]
     )
     result = refreshed(earlier, evidence, index_std=POORLY_KNOWN)
-    assert [change.name for change in result.changes] == ["water 2"]
+    assert index_in(result.calibration, "pool")[1] == pytest.approx(POORLY_KNOWN)
+    assert index_in(result.calibration)[1] < 0.6 * POORLY_KNOWN
     assert "step: left out" in result.warnings[0]
 
 
 def test_steps_near_and_far_bring_lengths_back(earlier, thesis):
     near_and_far = steps(with_fine_target(thesis), depths_mm=(-45.0, -15.0, 15.0, 60.0, 85.0))
     result = refreshed(earlier, near_and_far, index_std=POORLY_KNOWN)
-    change = result.changes[0]
-    assert abs(change.index - INDEX) < 3 * change.std < 1e-3
+    index, std = index_in(result.calibration)
+    assert abs(index - INDEX) < 3 * std < 1e-3
     # With other noise up to 0.49 times.
     assert length_error(result.calibration) < 0.75 * length_error(earlier)
 
@@ -145,12 +169,13 @@ def test_stated_uncertainties_of_the_index_hold(thesis):
     """Pulls of independent calibrations and steps: the mean square of 5 is within 0.04 and 4.1 (chi2, 99.8 %)."""
     pulls = []
     for seed in range(5):
-        change = refreshed(
+        result = refreshed(
             calibrated(thesis, seed=seed, columns=9),
             steps(thesis, depths_mm=(15.0, 80.0), seed=seed),
             index_std=POORLY_KNOWN,
-        ).changes[0]
-        pulls.append((change.index - INDEX) / change.std)
+        )
+        index, std = index_in(result.calibration)
+        pulls.append((index - INDEX) / std)
     # The prior holds the index 6e-4 too low and has its share, a fifth of that, of the square.
     assert 0.04 < np.mean(np.square(pulls)) < 4.5
 
@@ -244,9 +269,10 @@ def test_correlations_of_the_earlier_estimate_count(earlier, thesis):
     covariance = tuple(map(tuple, np.diag(np.diag(earlier.joint.covariance)).tolist()))
     loose = earlier.model_copy(update={"joint": earlier.joint.model_copy(update={"covariance": covariance})})
     full, alone = (
-        refreshed(each, steps(thesis), index_std=POORLY_KNOWN).changes[0].length for each in (earlier, loose)
+        largest_length_std(refreshed(each, steps(thesis), index_std=POORLY_KNOWN).calibration)
+        for each in (earlier, loose)
     )
-    assert alone.after_mm > 1.5 * full.after_mm
+    assert alone > 1.5 * full
 
 
 def test_the_file_holds_old_and_new_water(earlier, thesis, tmp_path):
@@ -263,7 +289,7 @@ def test_the_file_holds_old_and_new_water(earlier, thesis, tmp_path):
     assert (np.array(joint.std[:count]) <= np.array(before.std) * (1 + 1e-6)).all()
     assert set(joint.scatter_px) == {*before.scatter_px, "stripe on the step"}
     assert len(joint.images) == len(before.images) + 1
-    assert calibration.provenance["refreshed"][0]["date"] == earlier.provenance.get("date")
+    assert calibration.provenance["earlier"]["digest"] == calibration_digest(earlier)
     # The new water is that of use, over the same volume, and its index is the new one.
     region = list_regions(calibration)[0]
     assert region.name == "water 2"
@@ -271,12 +297,9 @@ def test_the_file_holds_old_and_new_water(earlier, thesis, tmp_path):
     known = read_region_estimate(calibration, region)
     assert known.parameters.medium_index(known.values, known.view) == calibration.media[1].index
     assert read_stored_estimate(calibration, thesis, WARM).view == ViewMedium(True, 1)
-    std = compute_mesh_lengths(known, region).std_mm(known.covariance)
-    assert std.max() == pytest.approx(result.changes[0].length.after_mm, rel=0.1)
     assert make_certificate(calibration, path, issued="2026-01-01").validity[0].name == "water 2"
     again = refreshed(calibration, steps(thesis, seed=2), index_std=POORLY_KNOWN)
-    assert again.changes[0].name == "water 3"
-    assert len(again.calibration.provenance["refreshed"]) == 2
+    assert index_in(again.calibration, "water 3")[1] < 0.6 * POORLY_KNOWN
 
 
 @pytest.mark.parametrize("wrong", [{"height_mm": 23.4}, {"index": 1.3385}])
@@ -311,7 +334,7 @@ def test_a_sensor_that_has_changed_is_noticed(earlier, thesis):
 @pytest.fixture(scope="module")
 def drawn(tmp_path_factory):
     """A calibration of the coarse sensor in water of 25 degC, and steps drawn in water of index 1.3312."""
-    folder = tmp_path_factory.mktemp("refresh")
+    folder = tmp_path_factory.mktemp("earlier")
     square = drawn_stripes.SENSOR.laser.window.model_copy(update={"tilt_y_deg": 0.0})
     sensor = drawn_stripes.SENSOR.model_copy(
         update={"laser": drawn_stripes.SENSOR.laser.model_copy(update={"window": square})}
@@ -331,27 +354,21 @@ def step_capture(folder, described_by, name="step.h5", **header):
     return drawn_stripes.write(folder / name, images, **(described | header))
 
 
-def test_the_command_refreshes_and_says_what_changed(drawn):
+def test_the_command_adds_new_water(drawn):
     folder, sensor = drawn
-    capture = step_capture(folder, sensor)
-    told = ("refresh", folder / "calibration.json", "--step", capture, "--index-std", 0.001)
-    done = uwlts(*told)
+    capture, new = step_capture(folder, sensor), folder / "today.json"
+    told = ("calibrate", "--earlier", folder / "calibration.json", "--step", capture, "--new-water")
+    done = uwlts(*told, "--index-std", 0.001, "--out", new)
     assert done.returncode == 0, done.stderr
-    new = load_calibration(folder / "calibration.refreshed.json")
-    assert f"index of water 2: {WARM.refractive_index(WAVELENGTH):.5f} ± 0.001 before, {new.media[1].index:.5f} ±" in (
-        done.stdout
-    )
-    assert "now (k = 2, from the calibration)" in done.stdout
-    std = new.joint.std_of(MediumIndex("water 2"))
-    assert abs(new.media[1].index - 1.3312) < 3 * std
+    found = load_calibration(new)
+    index, std = index_in(found)
+    assert f"index of water 2: {index:.6g} ± {std:.2g} (0.001)" in done.stdout
+    assert abs(index - 1.3312) < 3 * std
     assert std < 9e-4
-    origin = json.loads((folder / "calibration.refreshed.json").read_text(encoding="utf-8"))["provenance"]
+    origin = json.loads(new.read_text(encoding="utf-8"))["provenance"]
     assert origin["step_captures"][0]["sha256"]
-    assert origin["refreshed"][0]["step_captures"] == ["step.h5"]
-    again = uwlts(*told)
-    assert again.returncode == 2
-    assert "exists already" in again.stderr
-    twice = uwlts("refresh", folder / "calibration.refreshed.json", "--step", capture)
+    assert origin["earlier"]["digest"] == calibration_digest(load_calibration(folder / "calibration.json"))
+    twice = uwlts("calibrate", "--earlier", new, "--step", capture, "--out", folder / "twice.json")
     assert twice.returncode == 2
     assert "step.h5 was already used for this calibration: take a new image" in twice.stderr
 
@@ -363,7 +380,6 @@ def renamed(sensor, **changes):
 @pytest.mark.parametrize(
     ("header", "error", "said"),
     [
-        (lambda s: {"medium": Medium(kind="air")}, CalibrationError, "was taken in air"),
         (lambda s: {"artefact": None}, DescriptionError, "does not describe its step standard"),
         (
             lambda s: {"sensor": renamed(s, name="other")},
@@ -393,7 +409,7 @@ def test_an_unsuitable_capture_is_refused(drawn, tmp_path, header, error, said):
     calibration = load_calibration(folder / "calibration.json")
     path = step_capture(tmp_path, sensor, **header(sensor))
     with Capture(path) as capture, pytest.raises(error, match=said):
-        refresh(calibration, [capture])
+        calibrate(earlier=calibration, step=[capture])
 
 
 def test_a_capture_given_twice_is_refused(drawn, tmp_path):
@@ -404,16 +420,22 @@ def test_a_capture_given_twice_is_refused(drawn, tmp_path):
     copy.write_bytes(path.read_bytes())
     known, said = load_calibration(folder / "calibration.json"), r"step\.h5 and copy\.h5 are the same capture"
     with Capture(path) as one, Capture(copy) as other, pytest.raises(CalibrationError, match=said):
-        refresh(known, [one, other])
+        calibrate(earlier=known, step=[one, other])
 
 
 def test_an_unsuitable_calibration_is_refused(drawn, earlier):
     folder, sensor = drawn
-    with pytest.raises(CalibrationError, match="calibrate jointly"):
-        refresh(nominal_calibration(sensor), [])
-    with pytest.raises(CalibrationError, match="has no window"):
-        refresh(earlier.model_copy(update={"window": None}), [])
-    with pytest.raises(CalibrationError, match="is empty: give at least one image of a step"):
-        refresh(earlier, [])
-    with Capture(step_capture(folder, sensor, "again.h5")) as capture, pytest.raises(RangeError, match="be positive"):
-        refresh(load_calibration(folder / "calibration.json"), [capture], index_std=0.0)
+    with pytest.raises(DescriptionError, match="no captures of a target"):
+        calibrate(earlier=earlier)
+    with pytest.raises(DescriptionError, match="leave out `distortion`"):
+        calibrate(earlier=earlier, step=["step.h5"], distortion=("k1",))
+    with Capture(step_capture(folder, sensor, "again.h5")) as capture:
+        with pytest.raises(CalibrationError, match="calibrate jointly"):
+            calibrate(earlier=nominal_calibration(sensor), step=[capture])
+        with pytest.raises(CalibrationError, match="the calibration is for air only"):
+            calibrate(
+                earlier=load_calibration(folder / "calibration.json").model_copy(update={"window": None}),
+                step=[capture],
+            )
+        with pytest.raises(RangeError, match="be positive"):
+            calibrate(earlier=load_calibration(folder / "calibration.json"), step=[capture], index_std=0.0)
