@@ -5,7 +5,7 @@
 Sensor, water and surface are drawn as in the tests of `uwlts.recalibrate`; images follow from Fermat's principle. After
 the first pass, the sensor moves as advised, or as drawn: uniform shifts of up to 60 mm along Y, and 80 mm along Z, a
 turn about Z and a roll of up to 30 deg about X, one of the four or all of them. Motions that see less than 30 % of the
-first pass's scene are drawn again. A campaign ends when 100 mm along Y and Z have a standard uncertainty of
+first pass's scene are drawn again. The poses have the stated standard uncertainties. A campaign ends when 100 mm along Y and Z have a standard uncertainty of
 ``enough_mm`` (rms), or after eight passes.
 """
 
@@ -17,6 +17,7 @@ from cyclopts import App
 from scipy.spatial.transform import Rotation
 
 from docs.studies.result_tables import publish, table
+from tests.uwlts.recalibration import test_recalibration
 from tests.uwlts.recalibration.test_recalibration import TRAVEL, campaign, draw_sensor, draw_surface, record, solve
 from uwlts.errors import CalibrationError
 from uwlts.model.calibration import rigid_transform
@@ -70,10 +71,20 @@ app = App(help=__doc__)
 
 
 @app.default
-def main(*, first: int = 0, count: int = 10, enough_mm: float = 0.05, write: bool = False) -> None:
+def main(
+    *,
+    first: int = 0,
+    count: int = 10,
+    enough_mm: float = 0.05,
+    pose_std_mm: float = 0.01,
+    pose_std_deg: float = 0.005,
+    kinds: str = ",".join(KINDS),
+    write: bool = False,
+) -> None:
     """Run campaigns of each kind, and publish the table."""
-    rows = []
-    for kind in KINDS:
+    rows, motion = [], test_recalibration.MOTION
+    test_recalibration.MOTION = replace(motion, pose_mm=pose_std_mm, pose_rad=float(np.radians(pose_std_deg)))
+    for kind in kinds.split(","):
         results = []
         for seed in range(first, first + count):
             results.append(run(seed, kind, enough_mm))

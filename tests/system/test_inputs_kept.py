@@ -66,7 +66,6 @@ def test_all_commands_with_outputs_are_covered():
         "uwlts evaluate",
         "uwlts calibrate",
         "uwlts camera",
-        "uwlts refresh",
         "uwlts polynomials",
         "uwlts certificate",
         "uwlts nominal",
