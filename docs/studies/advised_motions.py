@@ -5,8 +5,8 @@
 Sensor, water and surface are drawn as in the tests of `uwlts.recalibrate`; images follow from Fermat's principle. After
 the first pass, the sensor moves as advised, or as drawn: uniform shifts of up to 60 mm along Y, and 80 mm along Z, a
 turn about Z and a roll of up to 30 deg about X, one of the four or all of them. Motions that see less than 30 % of the
-first pass's scene are drawn again. The poses have the stated standard uncertainties. A campaign ends when 100 mm along Y and Z have a standard uncertainty of
-``enough_mm`` (rms), or after eight passes.
+first pass's scene are drawn again. The poses have the stated standard uncertainties. A campaign ends when 100 mm along
+Y and Z have a standard uncertainty of ``enough_mm`` (rms), or after eight passes.
 """
 
 from contextlib import suppress
