@@ -13,7 +13,7 @@ from uwlts.calibration.camera.target_poses import Poses
 from uwlts.calibration.joint.earlier import join_media, merge_with_earlier, read_earlier, require_suitable
 from uwlts.calibration.joint.estimate import Estimate
 from uwlts.calibration.joint.gathering import Gathered, gather_jointly, hold_camera
-from uwlts.calibration.joint.policy import explain_by_index, solve_consistently
+from uwlts.calibration.joint.policy import explain_refusal, solve_consistently
 from uwlts.calibration.joint.scanned_surfaces import ScannedPlane, SurfaceScanEvidence
 from uwlts.calibration.joint.stored_estimate import build_calibration
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, calibrate_sequentially
@@ -74,7 +74,7 @@ def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointRe
             for piece, parts in zip(problem.evidence, result.residuals, strict=True):
                 for part in parts:
                     off_px.setdefault(piece.sources[part.image], []).append(robust_std(part.values))
-            raise CalibrationError((earlier and explain_by_index(problem)) or against.refusal())
+            raise CalibrationError(explain_refusal(problem, against))
     except CalibrationError as error:
         table = "".join(series.found.table(off_px) for series in gathered.series)
         raise CalibrationError(f"{error}{table}") from error

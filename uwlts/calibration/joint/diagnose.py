@@ -370,8 +370,8 @@ def _check_earlier(result: Estimate) -> _Found:
             bool(sigmas[worst] > _WRONG),
             f"the new images contradict the earlier calibration by {sigmas[worst]:.1f} standard uncertainties, mostly "
             f"in the {quantity.words}: {quantity.format_value(value, std)} instead of "
-            f"{quantity.format_with_std(known, std)}: check heights and media in the captures, and whether the water "
-            "is another (`new_water`); if they are right, the sensor has changed: calibrate again",
+            f"{quantity.format_with_std(known, std)}: check heights and media in the captures; if they are right, the "
+            "sensor has changed: calibrate again",
         )
 
 

@@ -156,7 +156,8 @@ def gather_jointly(
     if steps and not on_steps:
         raise CalibrationError(explain_captures_without_stripe(steps))
     for capture in scans:
-        name = capture.header.medium_name if options.same_water else f"{capture.header.medium_name} of the scans"
+        same = options.same_water or options.earlier is not None
+        name = capture.header.medium_name if same else f"{capture.header.medium_name} of the scans"
         on_scans.append(scan_stripes(capture, _identify_view(capture, media, name), stripe=options.stripe))
     seen = [capture.header.sensor for capture in [*steps, *targets, *scans]]
     sensor = next((each for each in seen if each.camera.window.mounted), sensor)

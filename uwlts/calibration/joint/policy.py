@@ -105,21 +105,24 @@ def solve_and_check(problem: JointProblem) -> tuple[Estimate, Findings]:
     return result, against
 
 
-def explain_by_index(problem: JointProblem) -> str:
-    """Describe an index of new media that makes evidence agree with an earlier calibration, or return an empty text."""
+def explain_refusal(problem: JointProblem, against: Findings) -> str:
+    """Describe what contradicts an estimate; images after an earlier calibration by an index that would explain them."""
     priors = problem.parameters.priors
     new = [key for key in problem.parameters.keys if isinstance(key, MediumIndex) and np.isfinite(priors[key].std)]
-    free = {key: replace(priors[key], std=_ANY_INDEX) for key in new}
-    result, against = solve_and_check(replace(problem, parameters=replace(problem.parameters, priors=priors | free)))
-    if against.all_against():
-        return ""
+    if problem.parameters.earlier is None:
+        return against.refusal()
+    if not new:
+        return f"{against.refusal()}; if the water is other than before, give `new_water`"
+    free = priors | {key: replace(priors[key], std=_ANY_INDEX) for key in new}
+    result, left = solve_and_check(replace(problem, parameters=replace(problem.parameters, priors=free)))
     found, std = dict(zip(result.parameters.keys, result.values.tolist(), strict=True)), result.std()
     off = {key: abs(found[key] - priors[key].mean) / float(np.hypot(std[key], priors[key].std)) for key in new}
-    return "; ".join(
+    words = [
         format_deviation(key, found[key], priors[key].mean, priors[key].std, sigmas=sigmas)
         for key, sigmas in off.items()
-        if sigmas >= DOUBTFUL
-    )
+        if sigmas >= DOUBTFUL and not left.all_against()
+    ]
+    return "; ".join(words) or against.refusal()
 
 
 @dataclass(frozen=True)
@@ -364,7 +367,10 @@ class _Attempt:
         """Count all residuals of an image as one if images show systematic deviations, or their halves disagree.
 
         An incomplete model also biases lens and poses, so that kinds of residuals that fit well are affected too.
+        Without images of a target, the model is that of an earlier calibration, which they then contradict.
         """
+        if self.options.earlier is not None and not self.gathered.series:
+            return None
         halves = [h for h in self.problem.linearise(self.result).compare_halves() if h.sigmas() > HALVES_APART]
         if not halves and not self.against.all_against():
             return None

@@ -138,7 +138,7 @@ def test_water_that_is_described_alike_is_the_same_unless_it_is_new(earlier, the
     assert [known.medium for known in result.calibration.media] == [WARM]
     index, std = index_in(result.calibration, "water")
     assert abs(index - WARM.refractive_index(WAVELENGTH)) < 3 * std
-    with pytest.raises(CalibrationError, match=r"whether the water is another \(`new_water`\)"):
+    with pytest.raises(CalibrationError, match=r"other than before, give `new_water`"):
         solve_jointly(steps(thesis, index=1.3385), options=options)
 
 
