@@ -106,7 +106,7 @@ def solve_and_check(problem: JointProblem) -> tuple[Estimate, Findings]:
 
 
 def explain_refusal(problem: JointProblem, against: Findings) -> str:
-    """Describe what contradicts an estimate; images after an earlier calibration by an index that would explain them."""
+    """Describe what contradicts an estimate, after an earlier calibration also by an index that would explain it."""
     priors = problem.parameters.priors
     new = [key for key in problem.parameters.keys if isinstance(key, MediumIndex) and np.isfinite(priors[key].std)]
     if problem.parameters.earlier is None:
