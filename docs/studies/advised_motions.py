@@ -79,6 +79,7 @@ def main(
     pose_std_mm: float = 0.01,
     pose_std_deg: float = 0.005,
     kinds: str = ",".join(KINDS),
+    name: str = "motions",
     write: bool = False,
 ) -> None:
     """Run campaigns of each kind, and publish the table."""
@@ -96,7 +97,7 @@ def main(
             [kind, str(count), f"{images.mean():.0f}", f"{images.max()}", f"{second:.3f}", f"{failed} of {count}"]
         )
     head = ["motions", "campaigns", "images (mean)", "images (most)", "after two passes, mm (median)", "not reached"]
-    publish({"advised motions": table(head, rows)}, write=write)
+    publish({f"advised {name}": table(head, rows)}, write=write)
 
 
 if __name__ == "__main__":

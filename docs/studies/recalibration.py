@@ -335,6 +335,7 @@ def main(
     kinds: str = "shifted",
     checks: int = 0,
     keep: Path | None = None,
+    name: str = "by passes",
     write: bool = False,
 ) -> None:
     """Run campaigns of kinds (shifted, turned, robot, turned robot) and checks with each fault; publish the tables."""
@@ -360,7 +361,10 @@ def main(
         + ["" if fault == "none" else f"{sum(is_named(fault, own) for own in each)} of {len(each)}"]
         for fault, each in doubts.items()
     ]
-    publish({"recalibration by passes": table(HEAD, rows), "checks by passes": table(CHECKED, found)}, write=write)
+    tables = {f"recalibration {name}": table(HEAD, rows)} | (
+        {f"checks {name}": table(CHECKED, found)} if checks else {}
+    )
+    publish(tables, write=write)
 
 
 if __name__ == "__main__":
