@@ -51,7 +51,7 @@ JOBS: dict[str, str] = {
         uwlts calibrate --air inputs/scans/target-bare.h5 --target-poses stage --out sequential/air.json""",
     "polynomials": "uwlts polynomials --captures inputs/scans/target-water.h5 --out polynomials/calibration.json",
     "earlier": """
-        uwlts calibrate --earlier joint/calibration.json --step inputs/scans/step-today.h5 --new-water \
+        uwlts calibrate --calibration joint/calibration.json --step inputs/scans/step-today.h5 --new-water \
             --out earlier/calibration.json""",
     "camera": "uwlts camera inputs/photographs --out camera/camera.yaml",
     "import": """

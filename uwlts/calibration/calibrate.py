@@ -119,7 +119,7 @@ def calibrate(
     strict: bool = False,
     refractions: Literal[1, 2] = 2,
     target_poses: Poses = "stage-normal",
-    earlier: Calibration | str | Path | None = None,
+    calibration: Calibration | str | Path | None = None,
     distortion: Distortion = "auto",
     pixels: Pixels = "auto",
     index: float | None = None,
@@ -148,12 +148,12 @@ def calibrate(
     joint : bool
         Estimate all parameters together, as always with ``water`` or ``scan``. Prior knowledge and its uncertainty are
         taken from the sensor's description.
-    earlier : Calibration or path, optional
-        Joint calibration of the sensor: its estimate, with all correlations, is prior knowledge in place of the
+    calibration : Calibration or path, optional
+        Earlier joint calibration of the sensor: its estimate, with all correlations, is prior knowledge in place of the
         description. Images of a target, of a step or a scan then suffice each, also for other water.
     new_water : bool
         The scans were taken in other water than the target, or on another day: also estimate its index. With
-        ``earlier``, all captures were.
+        an earlier ``calibration``, all captures were.
     unknown_sizes : bool
         Estimate diameters and spacings of scanned objects, even if their descriptions state an uncertainty.
     strict : bool
@@ -203,16 +203,16 @@ def calibrate(
     require_coefficients(distortion)
     if index_std is not None and not index_std > 0:
         raise RangeError(f"the standard uncertainty of the index is {index_std:g}; it must be positive")
-    if not (air or water or (earlier is not None and (step or scan))):
+    if not (air or water or (calibration is not None and (step or scan))):
         raise DescriptionError(
-            "no captures of a target to calibrate from: give `air` or `water`, or `earlier` with `step` or `scan`"
+            "no captures of a target to calibrate from: give `air` or `water`, or an earlier `calibration` with `step` or `scan`"
         )
-    if not scan and (unknown_sizes or (new_water and earlier is None)):
+    if not scan and (unknown_sizes or (new_water and calibration is None)):
         raise DescriptionError("`new_water` and `unknown_sizes` apply to scans: give `scan`, too")
-    if earlier is not None:
+    if calibration is not None:
         if (distortion, pixels) != ("auto", "auto"):
-            raise DescriptionError("`earlier` states the lens: leave out `distortion` and `pixels`")
-        earlier = earlier if isinstance(earlier, Calibration) else read_calibration(earlier)
+            raise DescriptionError("the earlier `calibration` states the lens: leave out `distortion` and `pixels`")
+        calibration = calibration if isinstance(calibration, Calibration) else read_calibration(calibration)
     options = CalibrationOptions(
         refractions=refractions,
         poses=target_poses,
@@ -226,7 +226,7 @@ def calibrate(
         same_water=not new_water,
         sizes_known=not unknown_sizes,
         strict=strict,
-        earlier=earlier,
+        earlier=calibration,
     )
     with (
         open_captures(air) as in_air,
@@ -243,6 +243,6 @@ def calibrate(
         targets = [*in_air, *in_water]
         # The sequential calibration does not use prior knowledge of the lens.
         known = any(capture.header.sensor.uncertainty.focal_length is not None for capture in targets)
-        if joint or water or scan or known or earlier is not None:
+        if joint or water or scan or known or calibration is not None:
             return calibrate_jointly(targets, steps, scans, options=options, progress=progress).calibration
         return calibrate_sequentially(in_air, steps, options=options, progress=progress).calibration

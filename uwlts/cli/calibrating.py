@@ -47,7 +47,7 @@ def calibrate(
 
     Example: uwlts calibrate --water target-water.h5 --out calibration.json
 
-    Example: uwlts calibrate --earlier calibration.json --step step-today.h5 --new-water --out today.json
+    Example: uwlts calibrate --calibration calibration.json --step step-today.h5 --new-water --out today.json
     """
     from uwlts.calibration.camera.lens import require_coefficients
     from uwlts.calibration.joint.next_shot import advice_lines

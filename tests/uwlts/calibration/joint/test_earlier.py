@@ -357,7 +357,7 @@ def step_capture(folder, described_by, name="step.h5", **header):
 def test_the_command_adds_new_water(drawn):
     folder, sensor = drawn
     capture, new = step_capture(folder, sensor), folder / "today.json"
-    told = ("calibrate", "--earlier", folder / "calibration.json", "--step", capture, "--new-water")
+    told = ("calibrate", "--calibration", folder / "calibration.json", "--step", capture, "--new-water")
     done = uwlts(*told, "--index-std", 0.001, "--out", new)
     assert done.returncode == 0, done.stderr
     found = load_calibration(new)
@@ -368,7 +368,7 @@ def test_the_command_adds_new_water(drawn):
     origin = json.loads(new.read_text(encoding="utf-8"))["provenance"]
     assert origin["step_captures"][0]["sha256"]
     assert origin["earlier"]["digest"] == calibration_digest(load_calibration(folder / "calibration.json"))
-    twice = uwlts("calibrate", "--earlier", new, "--step", capture, "--out", folder / "twice.json")
+    twice = uwlts("calibrate", "--calibration", new, "--step", capture, "--out", folder / "twice.json")
     assert twice.returncode == 2
     assert "step.h5 was already used for this calibration: take a new image" in twice.stderr
 
@@ -409,7 +409,7 @@ def test_an_unsuitable_capture_is_refused(drawn, tmp_path, header, error, said):
     calibration = load_calibration(folder / "calibration.json")
     path = step_capture(tmp_path, sensor, **header(sensor))
     with Capture(path) as capture, pytest.raises(error, match=said):
-        calibrate(earlier=calibration, step=[capture])
+        calibrate(calibration=calibration, step=[capture])
 
 
 def test_a_capture_given_twice_is_refused(drawn, tmp_path):
@@ -420,22 +420,22 @@ def test_a_capture_given_twice_is_refused(drawn, tmp_path):
     copy.write_bytes(path.read_bytes())
     known, said = load_calibration(folder / "calibration.json"), r"step\.h5 and copy\.h5 are the same capture"
     with Capture(path) as one, Capture(copy) as other, pytest.raises(CalibrationError, match=said):
-        calibrate(earlier=known, step=[one, other])
+        calibrate(calibration=known, step=[one, other])
 
 
 def test_an_unsuitable_calibration_is_refused(drawn, earlier):
     folder, sensor = drawn
     with pytest.raises(DescriptionError, match="no captures of a target"):
-        calibrate(earlier=earlier)
+        calibrate(calibration=earlier)
     with pytest.raises(DescriptionError, match="leave out `distortion`"):
-        calibrate(earlier=earlier, step=["step.h5"], distortion=("k1",))
+        calibrate(calibration=earlier, step=["step.h5"], distortion=("k1",))
     with Capture(step_capture(folder, sensor, "again.h5")) as capture:
         with pytest.raises(CalibrationError, match="calibrate jointly"):
-            calibrate(earlier=nominal_calibration(sensor), step=[capture])
+            calibrate(calibration=nominal_calibration(sensor), step=[capture])
         with pytest.raises(CalibrationError, match="the calibration is for air only"):
             calibrate(
-                earlier=load_calibration(folder / "calibration.json").model_copy(update={"window": None}),
+                calibration=load_calibration(folder / "calibration.json").model_copy(update={"window": None}),
                 step=[capture],
             )
         with pytest.raises(RangeError, match="be positive"):
-            calibrate(earlier=load_calibration(folder / "calibration.json"), step=[capture], index_std=0.0)
+            calibrate(calibration=load_calibration(folder / "calibration.json"), step=[capture], index_std=0.0)
