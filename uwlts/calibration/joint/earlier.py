@@ -86,10 +86,10 @@ def read_earlier(calibration: Calibration, gathered: Gathered) -> StoredEstimate
     parameters, covariance = known.parameters, known.covariance.copy()
     seen = {part.view.medium for part in (*gathered.series, *gathered.scans)} | {v.medium for _, v in gathered.steps}
     drift_k = gathered.sensor.uncertainty.drift_k
-    for number in seen & {*range(len(parameters.media))}:
-        place = parameters.places[parameters.index_key(number)]
-        medium = calibration.media[number].medium
-        covariance[place, place] += (medium.index_per_kelvin(calibration.wavelength_nm) * drift_k) ** 2
+    for number, each in enumerate(calibration.media):
+        if number in seen:
+            place = parameters.places[parameters.index_key(number)]
+            covariance[place, place] += (each.medium.index_per_kelvin(calibration.wavelength_nm) * drift_k) ** 2
     other: set[ParameterKey] = set()
     if gathered.series and gathered.series[0].found.target.model_dump(mode="json") != calibration.origin().target:
         other |= {key for key in parameters.keys if isinstance(key, TargetParameter)}
