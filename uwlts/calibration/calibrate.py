@@ -205,8 +205,8 @@ def calibrate(
         raise RangeError(f"the standard uncertainty of the index is {index_std:g}; it must be positive")
     if not (air or water or (calibration is not None and (step or scan))):
         raise DescriptionError(
-            "no captures of a target to calibrate from: give `air` or `water`, or an earlier `calibration` with `step` or "
-            "`scan`"
+            "no captures of a target to calibrate from: give `air` or `water`, or an earlier `calibration` with `step` "
+            "or `scan`"
         )
     if not scan and (unknown_sizes or (new_water and calibration is None)):
         raise DescriptionError("`new_water` and `unknown_sizes` apply to scans: give `scan`, too")
