@@ -177,7 +177,7 @@ def test_the_next_pass_is_advised_after_each_one(tmp_path):
         rotation = SimpleNamespace(x=0.0, y=0.0, z=np.sin(np.radians(turn) / 2), w=np.cos(np.radians(turn) / 2))
         scan._place(advice, SimpleNamespace(pose=SimpleNamespace(position=place, orientation=rotation)))
         advice.add(tmp_path / f"{each.name}.h5", advice.pose, Mock())
-        # What was found in it is kept.
+        # Its stripes are kept.
         (tmp_path / f"{each.name}.h5").unlink()
     stated = [float(line.split("+-")[1].removesuffix(" mm")) for text in told for line in text.splitlines()[:2]]
     assert max(stated[:2]) > 0.5 and max(stated[2:]) < 0.25, told
