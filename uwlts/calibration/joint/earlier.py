@@ -132,12 +132,14 @@ def merge_with_earlier(new: Calibration, earlier: Calibration) -> Calibration:
 def _merge_estimates(before: JointEstimate, new: JointEstimate) -> JointEstimate:
     """Return the new estimate with the record of both estimates' evidence."""
     stated = dict(zip(before.parameters, before.std_before, strict=True))
-    own = dict(zip(new.parameters, new.std_before, strict=True))
     regions = {(region.window, region.medium): region for region in before.covered}
     regions |= {(region.window, region.medium): _extend_region(region, regions) for region in new.covered}
     return new.model_copy(
         update={
-            "std_before": tuple((own | stated)[key] for key in new.parameters),
+            # Parameters of the earlier estimate have no other prior knowledge in the new one.
+            "std_before": tuple(
+                stated.get(key) if std is None else std for key, std in zip(new.parameters, new.std_before, strict=True)
+            ),
             "scatter_px": before.scatter_px | new.scatter_px,
             "shared_variance": before.shared_variance | new.shared_variance,
             "residual_count": before.residual_count + new.residual_count,

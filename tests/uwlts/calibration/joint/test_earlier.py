@@ -24,7 +24,7 @@ from uwlts.calibration.sequential.sequential_calibration import CalibrationOptio
 from uwlts.errors import CalibrationError, DescriptionError, RangeError
 from uwlts.model.artefacts import StepStandard
 from uwlts.model.calibration import calibration_digest
-from uwlts.model.parameter_keys import MediumIndex, SheetParameter, StepHeight, parse_parameter
+from uwlts.model.parameter_keys import MediumIndex, SheetParameter, StepHeight, TargetParameter, parse_parameter
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Medium
 from uwlts.optics.nominal import nominal_calibration
@@ -140,6 +140,19 @@ def test_water_that_is_described_alike_is_the_same_unless_it_is_new(earlier, the
     assert abs(index - WARM.refractive_index(WAVELENGTH)) < 3 * std
     with pytest.raises(CalibrationError, match=r"other than before, give `new_water`"):
         solve_jointly(steps(thesis, index=1.3385), options=options)
+
+
+def test_another_target_is_known_as_described(earlier, thesis):
+    """The same target is better known after further images of it."""
+    positions, index = np.arange(4) * 40.0 - 80.0, WARM.refractive_index(WAVELENGTH)
+    series = target_series(BUILT, medium=0, positions=positions, noise=noise(7), columns=9, index=index)
+    evidence = replace(gathered(thesis, [series]), media={"water": WARM})
+    other = earlier.model_copy(update={"provenance": earlier.provenance | {"target": {}}})
+    same, fresh = (
+        solve_jointly(evidence, options=replace(OPTIONS, earlier=each)).calibration.joint.std_of(TargetParameter.BOW)
+        for each in (earlier, other)
+    )
+    assert same < earlier.joint.std_of(TargetParameter.BOW) < 0.9 * fresh
 
 
 def test_water_whose_steps_are_left_out_is_not_said_to_be_measured(earlier, thesis):
