@@ -171,10 +171,8 @@ def _extend_region(region: CoveredRegion, covered: Mapping[tuple[bool, int | Non
 def _extend_provenance(earlier: Calibration, new: dict[str, JsonValue]) -> dict[str, JsonValue]:
     """Return the provenance of both, with the lists of captures and warnings joined."""
     old = earlier.provenance
-    before: JsonValue = {"digest": calibration_digest(earlier)} | {
-        key: old.get(key) for key in ("source", "date", "software")
-    }
-    joined: dict[str, JsonValue] = {"earlier": before}
+    before: dict[str, JsonValue] = {key: old.get(key) for key in ("source", "date", "software")}
+    joined: dict[str, JsonValue] = {"earlier": before | {"digest": calibration_digest(earlier)}}
     for key, added in new.items():
         known = old.get(key)
         if isinstance(added, list) and isinstance(known, list):
