@@ -44,7 +44,9 @@ class Page:
     texts: dict[str, str] = field(default_factory=dict)
     """Text of a file in the page's folder."""
     small_python: bool = False
-    """True if Python blocks also use the smaller descriptions; tutorials are fast enough, and check their figures."""
+    """True if Python blocks also use the smaller descriptions; tutorials are fast enough."""
+    figures: str = ""
+    """Statements that check the figures of the page's Python blocks, among their names."""
     before: str = ""
     """Command lines that create the other required files."""
     instead: dict[str, str] = field(default_factory=dict)
@@ -212,6 +214,7 @@ def run_page(page: Path, how: Page, *, shared: Path | None, folder: Path, small:
                     ready = next((words for begin, words in how.ready.items() if begin in listed), None)
                     runner.command(text + " --overwrite" * bool(listed & set(how.again)), ready=ready)
                 ran += 1
+        exec(compile(how.figures, f"figures of {page}", "exec"), runner.names)
     assert not unused, f"{page} does not say what is listed for it: {unused}"
     return ran
 

@@ -264,14 +264,28 @@ PAGES_RUN = {
         texts={"schemas/dcc.xsd": SCHEMA.replace("COUNT", "2"), "schemas/other.xsd": IMPORTED},
     ),
     "docs/reference/api.md": Page(given={name: name for name in ("target-air.h5", "target-water.h5", "spheres.h5")}),
-    "docs/tutorials/calibrate-a-sensor.md": Page(small_python=True),
+    "docs/tutorials/calibrate-a-sensor.md": Page(
+        small_python=True,
+        figures="""
+assert abs(values(joint)[0] - truth[0]) < 1.0, "focal length within 1 px"
+assert abs(values(joint)[2] - truth[2]) < 0.5, "window distance within 0.5 mm"
+assert abs(spacing["joint"].error_mm) < 0.05
+""",
+    ),
     "docs/tutorials/choose-a-design.md": Page(
         prepare={"twin sweep study.toml --out runs/study": study_of_the_page},
         again=("twin sweep study.toml --out runs/study --verify 2",),
         instead={"--verify 2": "--verify 1", "steps = 26": "steps = 6", "steps = 24": "steps = 5"}
         | {'sensor = "thesis"': 'sensor = "thesis-small"'},
+        figures="""
+assert float(table["sigma_z_rms_mm"]) <= sigma[keeps].min() * 1.001
+assert table["near_mm"] >= 149.9 and table["line_mm"] >= 159.9
+""",
     ),
-    "docs/tutorials/import-foreign-images.md": Page(prepare={"uwlts import photographs": photographs_of_the_page}),
+    "docs/tutorials/import-foreign-images.md": Page(
+        prepare={"uwlts import photographs": photographs_of_the_page},
+        figures="assert len(view.pixels) > 100 and abs(calibration.camera.fx_px - true.focal_length_px()) < 2.0",
+    ),
     "docs/tutorials/learn-from-a-data-set.md": Page(
         instead={
             "scenes=50": "scenes=4",
@@ -279,13 +293,25 @@ PAGES_RUN = {
             "splits = { train = 0.8, test = 0.2, validation = 0 }",
         }
     ),
-    "docs/tutorials/photographs-to-cloud.md": Page(prepare={"uwlts import target": both_folders_of_the_page}),
+    "docs/tutorials/photographs-to-cloud.md": Page(
+        prepare={"uwlts import target": both_folders_of_the_page},
+        figures="""
+for figure in (evaluation.sphere_spacing, *evaluation.diameters):
+    assert abs(figure.error_mm) < figure.expanded_uncertainty_mm + 0.02  # 0.02 mm: U of the calibrated values
+""",
+    ),
     "docs/tutorials/photographs-to-sensor.md": Page(
         prepare={"uwlts camera photographs": photographs_with_description},
         instead={"Path.cwd().parents": "Path(uwlts.__file__).parents"},
+        figures="assert len(camera.lens.used) == 16 and apart < 3 * stated and turn < 3 * normals",
     ),
     "docs/tutorials/run-an-experiment.md": Page(instead={"SEEDS = range(3)": "SEEDS = range(1)"}),
-    "docs/tutorials/simulate-and-measure.md": Page(),
+    "docs/tutorials/simulate-and-measure.md": Page(
+        figures="""
+assert abs(result.sphere_spacing.error_mm) < 0.05 and result.std.value_mm < 0.05
+assert all(abs(figure.error_mm) < 0.10 for figure in result.diameters)
+"""
+    ),
 }
 
 

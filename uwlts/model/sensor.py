@@ -24,6 +24,7 @@ from pydantic_core import to_jsonable_python
 from uwlts.errors import DescriptionError
 from uwlts.files.reading import require_plain
 from uwlts.model import media, phase_functions
+from uwlts.model.short_text import Brief
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -631,7 +632,7 @@ class Uncertainty(Description):
         return float(np.tan(np.radians(self.stage_alignment_deg)))
 
 
-class Sensor(Description):
+class Sensor(Brief, Description):
     """Complete sensor and the media of its use, by name.
 
     ``more_lasers`` emit further sheets at the same time. ``stripe`` contains options of stripe detection

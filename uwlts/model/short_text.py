@@ -3,9 +3,10 @@
 import dataclasses
 import html
 from collections.abc import Collection, Mapping, Sequence, Set
-from pathlib import Path
 
-_LONGEST = 60  # largest number of characters of a value that is shown completely
+from pydantic import BaseModel
+
+_LONGEST = 70  # largest number of characters of a value that is shown completely
 _MOST = 8  # largest number of items of a value that is shown completely
 
 
@@ -40,14 +41,13 @@ def summarise_value(value: object) -> str:
     """Return a short text of a value."""
     if (shape := getattr(value, "shape", ())) and (dtype := getattr(value, "dtype", None)):
         return f"{' x '.join(map(str, shape))} {dtype}"
-    if value is None or isinstance(value, bool | int | float | str | Path):
-        text = str(value)
-        return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
-    if isinstance(value, Mapping | Sequence | Set):
+    if isinstance(value, Mapping | Sequence | Set) and not isinstance(value, str):
         if len(value) <= _MOST and len(text := repr(value)) <= _LONGEST and "\n" not in text:
             return text
         return f"{len(value)} {'entries' if isinstance(value, Mapping) else 'items'}"
-    return type(value).__name__
+    stated = value.model_dump(exclude_defaults=True).items() if isinstance(value, BaseModel) else ()
+    text = ", ".join(f"{name}={each}" for name, each in stated) or " ".join(str(value).split())
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 
 
 def align_columns(rows: Sequence[Sequence[str]], *, right: Collection[int] = ()) -> list[str]:

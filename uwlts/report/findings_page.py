@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.colors import ListedColormap
 
 from uwlts._version import __version__
 from uwlts.errors import EvaluationError
@@ -33,7 +34,6 @@ from uwlts.pages.toolkit import (
     INK,
     MISSING,
     RED,
-    Tile,
     figure_png,
     format_to_scale,
     new_figure,
@@ -56,18 +56,24 @@ from uwlts.report.measured_values import (
 )
 from uwlts.report.plot import DEVIATIONS, surface_limit_mm
 from uwlts.storage.calibration_file import load_calibration
-from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud import PointCloud, compute_normal_std
 from uwlts.storage.cloud_files import load_cloud
 from uwlts.storage.number_tables import Unit
 
 _BLEMISHES = (FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION)
 _FIRST = ("depth", "height", "remaining wall")
 """Quantities in the first columns of the table of findings."""
+_MAIN = _FIRST[:2]  # quantities in the first column of sizes
 _SMALLEST = 1e-6  # smaller uncertainties are shown as 0
 _SMALLEST_MM = 0.002  # precision that determines the decimals of figures without uncertainty
 _MOST_PICTURES = 40  # the largest findings come first
 FINDINGS = "findings"  # kind of the page, in the name of its JSON file
 _MOST_DRAWN = 60_000  # points of a picture; more look the same
+_VERDICT_COLOURS = dict(zip(VERDICTS, (RED, "#d9822b", "#2e8b57", INK), strict=True))
+_SEEN = "#b9c0c8", "#d9822b", "#8fb8a0"
+"""Colours of cells without points, with points that were not inspected, and with inspected ones."""
+_CELL_POINTS, _MOST_CELLS = 4, 160
+"""Mean number of points in a cell of the map of what was seen, and most cells along a side."""
 _AROUND = 1.2  # size of the area shown around a finding, relative to the finding
 
 
@@ -111,7 +117,7 @@ def write_findings(
     pdf
         Also print the page to a PDF beside it, with an installed Chromium or Chrome.
     title
-        Title of the report (default: "Inspection of" and the cloud's name).
+        Title of the report (default: the order's object, else "Inspection of" and the cloud's name).
     captures
         Captures from which the cloud was reconstructed, for traceability.
     calibration
@@ -122,7 +128,8 @@ def write_findings(
         Evaluations (JSON of uwlts evaluate) of artefacts measured with the same calibration; their figures are
         reported.
     order
-        TOML file with client, object, operator, date, sensor, water, and the tables ``datum`` (name, place_mm,
+        TOML file with client, object, report, revision, operator, checked_by, approved_by, date, sensor, water, and the
+        tables ``datum`` (name, place_mm,
         direction, twelve_o_clock) and ``limits`` (depth_mm, remaining_wall_mm, ovality_percent, undercut_mm), by which
         findings are judged.
     measured
@@ -166,11 +173,11 @@ def write_findings(
     found = inspect_cloud(points, kind, **options)
     if kind == "pipe" and (note := resolve_datum(stated.datum, found.features[0].axes[2])[2]):
         found = replace(found, notes=(*found.notes, note))
-    made, title = datetime.now(UTC).isoformat(timespec="seconds"), title or f"Inspection of {path.name}"
+    made, title = datetime.now(UTC), title or stated.object or f"Inspection of {path.name}"
     text = _page(found, points, sources, checks, stated, by_hand, title=title, made=made)
     record: Table = {
         "title": title,
-        "made": made,
+        "made": made.isoformat(timespec="seconds"),
         "software": f"uwlts {__version__}",
         "sources": [vars(source) for source in sources],
         "verification": [
@@ -259,7 +266,7 @@ def _page(
     by_hand: MeasuredValues | None,
     *,
     title: str,
-    made: str,
+    made: datetime,
 ) -> str:
     parts = [each for each in found.features if each.kind in _BLEMISHES]
     whole = [each for each in found.features if each.kind not in (*_BLEMISHES, FeatureKind.SECTION, FeatureKind.HOLE)]
@@ -268,24 +275,32 @@ def _page(
     parts, listed = (sort_by_severity(each, order.limits) for each in (parts, [*parts, *limited]))
     drawn = parts[:_MOST_PICTURES]
     kinds = list(dict.fromkeys(each.kind for each in found.features))
+    depths = sorted(COVERAGE_FACTOR * each[name].uncertainty for each in parts for name in _MAIN if name in each)
     return render_page(
         "uwlts.report",
         "findings.html.j2",
         title=title,
-        made=made,
-        worst=_tiles(parts),
-        statements=_facts(order, cloud, sources, found),
+        made=f"{_format_date(made)}, {made:%H:%M} UTC",
+        order=order,
+        scanned=order.date and _format_date(order.date),
+        limits=[
+            f"{name.rpartition('_')[0].replace('_', ' ')} {value:g} {name.rpartition('_')[2].replace('percent', '%')}"
+            for name, value in order.limits.model_dump(exclude_none=True).items()
+        ],
+        metadata=cloud.metadata,
+        sources=sources,
         conclusion=_conclude(listed, order, found),
         findings=_finding_rows(listed, found, cloud, order) if listed else None,
         all_values=_rows(parts),
         whole=[(each.name, [_value_row(value) for value in each.values]) for each in whole],
         repeated=_rows(repeated),
         by_hand=None if by_hand is None else (COLUMNS, [each.row() for each in by_hand.values]),
-        map=_map(found, cloud, parts),
-        pictures=[(each.title, _picture(each, found, cloud)) for each in drawn],
+        maps=_make_maps(found, cloud, parts, order),
+        accuracy=_point_accuracy(cloud),
+        depths=[format_to_scale(each, each, digits=2) for each in dict.fromkeys((*depths[:1], *depths[-1:]))],
+        pictures=[(each.title, judge_feature(each, order.limits)[0], _picture(each, found, cloud)) for each in drawn],
         left_out=len(parts) - len(drawn),
         notes=found.notes,
-        sources=[(each.role, each.name, each.note, each.sha256) for each in sources],
         checks=[(artefact, list(map(_check_row, figures))) for artefact, figures in checks],
         stated=cloud.uncertainty is not None,
         searched=found.kind == "pipe",
@@ -300,28 +315,8 @@ def _page(
     )
 
 
-def _facts(
-    order: FindingOrder, cloud: PointCloud, sources: Sequence[Source], found: Inspection
-) -> list[tuple[str, str]]:
-    """Return what the owner asks about an inspection, with the names of the limits."""
-    limits = [
-        f"{name.rpartition('_')[0].replace('_', ' ')} {value:g} {name.rpartition('_')[2].replace('percent', '%')}"
-        for name, value in order.limits.model_dump(exclude_none=True).items()
-    ]
-    certificates = [f"{each.name} ({each.note})" for each in sources if each.role == "certificate"]
-    on_pipe = found.kind == "pipe"
-    stated = {
-        "client": order.client,
-        "object": order.object,
-        "scanned": None if order.date is None else order.date.isoformat(),
-        "operator": order.operator,
-        "water": order.water or cloud.metadata.get("medium"),
-        "sensor": order.sensor or cloud.metadata.get("sensor"),
-        "certificate": ", ".join(certificates) or None,
-        "limits": ", ".join(limits) or None,
-        "datum": order.datum.name + (", clock read along the distance" if on_pipe else ""),
-    }
-    return [(name, str(text or "not stated")) for name, text in stated.items()]
+def _format_date(day: date) -> str:
+    return f"{day.day} {day:%B %Y}"
 
 
 def _conclude(listed: Sequence[Feature], order: FindingOrder, found: Inspection) -> tuple[str, str]:
@@ -336,8 +331,8 @@ def _conclude(listed: Sequence[Feature], order: FindingOrder, found: Inspection)
 
 def _finding_rows(
     listed: Sequence[Feature], found: Inspection, cloud: PointCloud, order: FindingOrder
-) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Return headings and rows of the first page: verdict, place and size of every finding."""
+) -> tuple[tuple[str, ...], list[tuple[str, tuple[str, ...]]]]:
+    """Return headings and rows of the first page: verdict, and texts on verdict, place and size of every finding."""
     whole = found.features[0]
     start = cloud.points_mm.min(axis=0)
     if whole.kind == FeatureKind.PIPE:
@@ -351,9 +346,9 @@ def _finding_rows(
         first = next(iter(names), each.values[0].name)
         said = f"{verdict} ({', '.join(names)})" if names else verdict
         said = f"{said}; {each.reason}" if each.reason else said
-        main = next((size[name] for name in ("depth", "height") if name in size), f"{first} {size[first]}")
+        main = next((size[name] for name in _MAIN if name in size), f"{first} {size[first]}")
         more = tuple(size.get(name, MISSING) for name in ("remaining wall", "length", "width"))
-        rows.append((each.title, said, *at, main, *more))
+        rows.append((verdict, (each.title, said, *at, main, *more)))
     heads = "finding", "verdict", clock, "from datum / mm", "depth or height / mm"
     return (*heads, "remaining wall / mm", "length / mm", "width / mm"), rows
 
@@ -397,54 +392,83 @@ def _rows(features: Sequence[Feature]) -> tuple[tuple[str, ...], list[tuple[str,
     return ("finding", "place / mm", *(f"{name} / {unit}" for name, unit in units.items())), rows
 
 
-def _tiles(parts: list[Feature]) -> list[Tile]:
-    tiles = []
-    for kind in _BLEMISHES:
-        if own := [each for each in parts if each.kind == kind]:
-            worst = max(own, key=lambda each: each.values[0].value)
-            value = worst.values[0]
-            plural = f"{kind}s" if len(own) > 1 else str(kind)
-            note = f"largest {value.name} {format_interval(value)} {value.unit} ({worst.name})"
-            tiles.append(Tile(plural, str(len(own)), note, accent=True))
-    walls = [each["remaining wall"] for each in parts if "remaining wall" in each]
-    if walls:
-        least = min(walls, key=lambda value: value.value)
-        tiles.append(Tile("least remaining wall", f"{format_interval(least)} {least.unit}", accent=True))
-    return tiles
+def _make_maps(
+    found: Inspection, cloud: PointCloud, parts: list[Feature], order: FindingOrder
+) -> tuple[str, str, list[str]]:
+    """Plot all points by their deviation, and what was seen and inspected; say in sentences what was not.
 
-
-def _map(found: Inspection, cloud: PointCloud, parts: list[Feature]) -> str:
-    """Plot all points by their deviation: a pipe unrolled along its axis, other objects in X and Y."""
-    seen = np.flatnonzero(np.isfinite(found.deviation_mm))
-    seen = seen[:: max(1, len(seen) // _MOST_DRAWN)]
-    whole = found.features[0] if found.features else None
-    pipe = whole if whole is not None and whole.kind == FeatureKind.PIPE else None
-    middle = cloud.points_mm[seen].mean(axis=0)
-    u, v = _map_coordinates(cloud.points_mm[seen], pipe, middle)
-    # Width for equal scales at a height of 5 inches, including the colour bar.
-    width = 1.8 + 4.5 * float(np.ptp(u)) / max(float(np.ptp(v)), 1e-9)
-    figure, (axes,) = new_figure(float(np.clip(width, 4.0, 9.0)), 5.0)
-    limit = surface_limit_mm(found.deviation_mm)
-    style: dict[str, Any] = {"cmap": DEVIATIONS, "vmin": -limit, "vmax": limit, "linewidths": 0, "s": 3}
-    colours = axes.scatter(u, v, c=found.deviation_mm[seen], rasterized=True, **style)
-    figure.colorbar(colours, ax=axes, label="above the undamaged surface / mm")
-    for each in parts:
-        x, y = _map_coordinates(each.place_mm[None], pipe, middle)
-        axes.annotate(each.name, (x[0], y[0]), xytext=(8, 8), textcoords="offset points", fontsize=8, color=INK)
-        axes.plot(x, y, "o", markersize=14, markerfacecolor="none", markeredgecolor=RED)
-    labels = ("along the axis / mm", "around the circumference / mm") if pipe else ("first extent / mm", "second / mm")
+    A pipe is unrolled along its axis, other objects are shown in X and Y, with the longer side along the page.
+    """
+    pipe = next((each for each in found.features if each.kind == FeatureKind.PIPE), None)
+    labels = ["X / mm", "Y / mm"] if pipe is None else ["along the axis / mm", "around the circumference / mm"]
+    middle = cloud.points_mm.mean(axis=0)
+    at = _map_coordinates(cloud.points_mm, pipe, middle)
+    marks = _map_coordinates(np.array([each.place_mm for each in parts]).reshape(-1, 3), pipe, middle)
+    ends = [(side.min(), side.max()) for side in at]
+    if pipe:
+        ends[1] = -np.pi * pipe["diameter"].value / 2, np.pi * pipe["diameter"].value / 2
+    # Cells have some points on average, and are not narrower than the distance of the profiles.
+    profile = np.unique(cloud.frame, return_inverse=True)[1]
+    apart = np.diff(np.sort(np.bincount(profile, at[0]) / np.bincount(profile)))
+    narrowest = 1.5 * float(np.median(apart)) if len(apart) else 0.0
+    cell = max(float(np.sqrt(_CELL_POINTS * np.prod(np.ptp(at, axis=1)) / len(cloud))), narrowest)
+    if np.ptp(at[1]) > np.ptp(at[0]):
+        at, marks, labels, ends = at[::-1], marks[::-1], labels[::-1], ends[::-1]
+    inspected = np.isfinite(found.deviation_mm)
+    shown = np.flatnonzero(inspected)[:: max(1, np.count_nonzero(inspected) // _MOST_DRAWN)]
+    # Equal scales; points are as large as their distances.
+    height = 7.2 * float(np.ptp(at[1]) / max(np.ptp(at[0]), 1e-9))
+    figure, (axes,) = new_figure(8.0, height + 1.5)
+    size = float(np.clip(1.5 * height * 7.2 * 72**2 / max(len(shown), 1), 1, 60))
+    colours = axes.scatter(*at[:, shown], c=found.deviation_mm[shown], rasterized=True, s=size, **_colour_scale(found))
+    figure.colorbar(colours, ax=axes, label="above the undamaged surface / mm", orientation="horizontal", aspect=50)
+    for each, place in zip(parts, marks.T, strict=True):
+        colour = _VERDICT_COLOURS[judge_feature(each, order.limits)[0]]
+        axes.annotate(each.name, tuple(place), xytext=(8, 8), textcoords="offset points", fontsize=8, color=INK)
+        axes.plot(*place, "o", markersize=14, markerfacecolor="none", markeredgecolor=colour, markeredgewidth=1.8)
     axes.set(xlabel=labels[0], ylabel=labels[1], aspect="equal")
-    return png_data_uri(figure, dpi=130)
+    cells = [int(np.clip((high - low) / cell, 4, _MOST_CELLS)) for low, high in ends]
+    every, own = (np.histogram2d(*at[:, some], bins=cells, range=ends)[0] > 0 for some in (slice(None), inspected))
+    seen, (axes,) = new_figure(8.0, 1.9)
+    extent, states = (*ends[0], *ends[1]), (every.astype(int) + own).T
+    axes.imshow(states, cmap=ListedColormap(_SEEN), vmin=0, vmax=2, extent=extent, origin="lower")
+    axes.set(xlabel=labels[0], ylabel=labels[1], aspect="auto")
+    axes.grid(visible=False)
+    whole = "circumference over the scanned length" if pipe else "rectangle around all points"
+    said = [f"{100 * np.mean(~every):.0f} % of the {whole} have no points (grey; cells of {cell:.2g} mm)."]
+    if (omitted := np.mean(every & ~own)) > 0:
+        said.append(f"{100 * omitted:.1f} % were seen but not inspected (orange), for the reasons below.")
+    if cut := [each.name for each in parts if each.reason]:
+        said.append(f"Not seen whole or not sized, with bounds instead of intervals: {', '.join(cut)}.")
+    return png_data_uri(figure, dpi=130), png_data_uri(seen, dpi=110), said
 
 
-def _map_coordinates(points: np.ndarray, pipe: Feature | None, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return map coordinates (N,) of points: along and around a pipe, centred at ``middle`` (3,), else X and Y."""
+def _colour_scale(found: Inspection) -> dict[str, Any]:
+    """Return the one scale of the map and of all pictures of findings."""
+    limit = surface_limit_mm(found.deviation_mm)
+    return {"cmap": DEVIATIONS, "vmin": -limit, "vmax": limit, "linewidths": 0}
+
+
+def _point_accuracy(cloud: PointCloud) -> list[str] | None:
+    """Return the expanded uncertainty of points across the surface; None if the cloud does not know it.
+
+    The texts are the median, those of its random and common parts, and the 95 % quantile, in mm.
+    """
+    random, common = compute_normal_std(cloud)
+    if random is None or common is None:
+        return None
+    every = COVERAGE_FACTOR * np.hypot(random, common)
+    typical = [float(np.median(each)) for each in (every, COVERAGE_FACTOR * random, COVERAGE_FACTOR * common)]
+    return [format_to_scale(each, typical[0], digits=2) for each in (*typical, float(np.quantile(every, COVERAGE)))]
+
+
+def _map_coordinates(points: np.ndarray, pipe: Feature | None, middle: np.ndarray) -> np.ndarray:
+    """Return map coordinates (2, N) of points: along and around a pipe, centred at ``middle`` (3,), else X and Y."""
     if pipe is None:
-        return points[:, 0], points[:, 1]
-    away = (points - pipe.place_mm) @ pipe.axes.T
-    side = (middle - pipe.place_mm) @ pipe.axes.T
+        return points[:, :2].T
+    away, side = ((some - pipe.place_mm) @ pipe.axes.T for some in (points, middle))
     angle = np.arctan2(away[:, 1], away[:, 0]) - np.arctan2(side[1], side[0])
-    return away[:, 2], (np.remainder(angle + np.pi, 2 * np.pi) - np.pi) * pipe["diameter"].value / 2
+    return np.array([away[:, 2], (np.remainder(angle + np.pi, 2 * np.pi) - np.pi) * pipe["diameter"].value / 2])
 
 
 def _picture(feature: Feature, found: Inspection, cloud: PointCloud) -> str:
@@ -456,12 +480,10 @@ def _picture(feature: Feature, found: Inspection, cloud: PointCloud) -> str:
     deep = max(2 * float(half.max()), 5.0)
     near &= np.abs(local[:, 2]) < deep
     local, deviation = local[near], found.deviation_mm[near]
-    figure, (above, cut) = new_figure(6.6, 3.6, columns=2)
-    limit = float(np.abs(deviation).max(initial=1e-3))
+    figure, (above, cut) = new_figure(7.4, 2.4, columns=2)
     size = float(np.clip(25_000 / max(len(local), 1), 2, 40))
-    style: dict[str, Any] = {"cmap": DEVIATIONS, "vmin": -limit, "vmax": limit, "linewidths": 0, "s": size}
-    colours = above.scatter(local[:, 0], local[:, 1], c=deviation, **style)
-    figure.colorbar(colours, ax=above, label="deviation / mm", orientation="horizontal", shrink=0.8)
+    colours = above.scatter(local[:, 0], local[:, 1], c=deviation, s=size, **_colour_scale(found))
+    figure.colorbar(colours, ax=above, label="deviation / mm")
     for other in found.select(*_BLEMISHES):
         outline = (other.outline_mm - feature.place_mm) @ feature.axes.T
         shown = len(outline) > 0 and bool((np.abs(outline) < [*half, deep]).all(axis=1).any())

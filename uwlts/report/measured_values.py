@@ -230,8 +230,12 @@ class FindingOrder(Description):
     """Order of an inspection, read from TOML; what it does not state is taken from the files or shown as missing."""
 
     client: str | None = None
-    object: str | None = None
+    object: str | None = None  # title of the report
+    report: str | None = None  # number of the report
+    revision: str | None = None
     operator: str | None = None
+    checked_by: str | None = None
+    approved_by: str | None = None
     date: datetime.date | None = None
     sensor: str | None = None
     water: str | None = None

@@ -1,4 +1,4 @@
-"""Static plots of clouds, stripes and calibrations, with matplotlib axes as input and output.
+"""Static plots with matplotlib axes: `cloud`, `stripe` (a laser image with its centres) and `residuals`.
 
 Every function draws into ``ax``, or into a new figure in the style of the pages, and returns the axes;
 ``ax.figure.savefig(...)`` saves them. `uwlts.pages.toolkit.figure_svg` converts a figure for a page.
@@ -25,6 +25,14 @@ from uwlts.pages.toolkit import BLUE, INK, make_figure, new_figure, plain_text
 from uwlts.storage.capture import Frame
 from uwlts.storage.cloud import PointCloud
 from uwlts.stripe import Stripe
+
+__all__ = ["cloud", "residuals", "stripe"]
+
+
+def __dir__() -> list[str]:
+    """Return the functions for programs, which notebooks offer."""
+    return __all__
+
 
 DEVIATIONS = LinearSegmentedColormap.from_list(
     "deviations", [(place, (red / 255, green / 255, blue / 255)) for place, (red, green, blue) in STOPS]

@@ -1,6 +1,7 @@
 """Report of an inspection: contents of page, JSON and PDF, and rejected inputs."""
 
 import json
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -57,7 +58,11 @@ def _ball(rng, *, calibration):
 def test_page_json_and_pdf_say_the_same(folder, chromium, monkeypatch):
     monkeypatch.chdir(folder)
     words = ["findings-report", "pipe.ply", "--wall-mm", "8", "--captures", "pipe.ply", "--out", "report.html", "--pdf"]
-    words += ["--verification", "ball.evaluation.json"]
+    words += ["--verification", "ball.evaluation.json", "--order", "order.toml"]
+    order = (
+        'object = "Pile 7"\nreport = "2026-117"\nchecked_by = "M. Okafor"\ndate = 2026-11-20\nlimits.depth_mm = 1.0\n'
+    )
+    (folder / "order.toml").write_text(order)
     app(words, result_action="return_value")
     record = json.loads((folder / "report.findings.json").read_text())
     pits = [each for each in record["inspection"]["features"] if each["kind"] == "pit"]
@@ -74,8 +79,18 @@ def test_page_json_and_pdf_say_the_same(folder, chromium, monkeypatch):
     page = chromium.new_page()
     page.goto((folder / "report.html").as_uri())
     text = page.inner_text("main")
+    verdict = page.locator("td.mark.bad").inner_text()
+    cut = page.evaluate("document.documentElement.scrollWidth > innerWidth")
     page.close()
-    assert "least remaining wall" in text.lower() and f"{wall['value']:.3f}" in text
+    assert text.startswith("Pile 7") and verdict == "exceeds the limit (depth)" and not cut
+    for stated in ("2026-117", "20 November 2026", "M. Okafor", f"{wall['value']:.3f}"):
+        assert stated in text
+    # The scan covers 120 of 360 deg; cells at both borders may count either way.
+    unseen = re.search(r"(\d+) % of the circumference over the scanned length have no points", text)
+    assert unseen is not None and float(unseen[1]) == pytest.approx(100 * 240 / 360, abs=2)
+    # Noise along Z alone; most of it is across the surface.
+    point = re.search(r"± ([\d.]+) mm \(random", text)
+    assert point is not None and 0.5 * 1.96 * NOISE_MM <= float(point[1]) <= 1.96 * NOISE_MM
     assert diameter["name"].replace("_", " ") in text
     for part in ("GUM", "VDI/VDE 2634", "ASME B31G", "Traceability", record["sources"][0]["sha256"]):
         assert part in text

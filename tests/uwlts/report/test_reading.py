@@ -132,10 +132,14 @@ def test_times_and_rotations_are_a_trajectory(tmp_path: Path, ending: str, names
 
 def test_results_are_short_texts():
     """Sizes in place of arrays: a screen has some 40 lines of 100 characters."""
-    for result in (cloud_of(100_000), uwlts.nominal("thesis", medium="water")):
+    evaluation = uwlts.evaluate(cloud_of(100), like={"kind": "plane"})
+    sensor = uwlts.load_sensor("thesis")
+    for result in (cloud_of(100_000), uwlts.nominal("thesis", medium="water"), sensor, evaluation):
         lines = repr(result).splitlines()
         assert len(lines) < 40 and max(map(len, lines)) <= 100 and str(result) == repr(result)
     assert "points_mm: 100000 x 3 float64" in repr(cloud_of(100_000))
+    assert "camera: width_px=1280, height_px=1024, pixel_size_um=5.3" in repr(sensor)
+    assert dir(uwlts.plot) == ["cloud", "residuals", "stripe"]
     assert "<td>100000 x 3 float64</td>" in cloud_of(100_000)._repr_html_()
 
 
