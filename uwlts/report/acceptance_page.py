@@ -66,18 +66,8 @@ def write_acceptance(path: str | Path, acceptance: Acceptance, *, pdf: bool = Fa
 def acceptance_page(acceptance: Acceptance) -> str:
     """Return the page as text."""
     plan = acceptance.plan
-    x, y, z = plan.volume_mm
     measured: list[Symbol] = [
         symbol for symbol in SYMBOLS if any(value.symbol == symbol for value in acceptance.values)
-    ]
-    statements = [
-        ("sensor", plan.sensor or "not stated"),
-        ("client", plan.client or "not stated"),
-        ("operator", plan.operator or "not stated"),
-        ("measuring volume", f"{x:g} x {y:g} x {z:g} mm (X, Y, Z), diagonal {plan.diagonal_mm():.0f} mm"),
-        ("decision rule", RULES[plan.decision_rule]),
-        ("calibration", f"{plan.calibration or 'clouds only'}, identifier {acceptance.calibration or MISSING}"),
-        ("judged", f"{acceptance.date.replace('T', ' ')}, by {acceptance.software}"),
     ]
     return render_page(
         "uwlts.report",
@@ -85,21 +75,15 @@ def acceptance_page(acceptance: Acceptance) -> str:
         title=plan.title,
         conclusion=f"{acceptance.conclusion[0].upper()}{acceptance.conclusion[1:]}.",
         colour=_DECISIONS.get(acceptance.verdict, "open"),
-        statements=statements,
+        acceptance=acceptance,
+        rule=RULES[plan.decision_rule],
         characteristics=[_characteristic_row(each) for each in acceptance.characteristics],
         limits=_draw_limits(acceptance) if acceptance.values else None,
         places=_draw_places(acceptance) if acceptance.values else None,
         lengths=_draw_lengths(acceptance) if any(value.length_mm for value in acceptance.values) else None,
-        requirements=[
-            (each.clause, "done" if each.met else "not met", each.required, each.done)
-            for each in acceptance.requirements
-        ],
-        remarks=acceptance.remarks,
         positions=[_position_row(number, each, measured) for number, each in enumerate(acceptance.positions, start=1)],
         measured=measured,
         artefacts=[_artefact_row(name, each) for name, each in plan.artefacts.items()],
-        temperature=plan.temperature,
-        digests=[(each.file, each.sha256 or MISSING) for each in acceptance.positions],
     )
 
 

@@ -41,16 +41,6 @@ PLACES_FORMATS = (".ply", ".laz", ".las")  # supported endings of the coloured c
 _COLOURS = colormaps["RdBu"]
 _NOT_SIGNIFICANT = "#cccccc"
 _INK = 60_000  # total area of all dots (square points), such that they nearly touch
-_COLUMNS = (
-    "region",
-    "centre / mm",
-    "area / mm²",
-    "extent / mm",
-    "largest / mm",
-    "mean / mm",
-    "level / mm",
-    "volume / mm³",
-)
 _MOST_ROWS = 20
 """Number of regions listed and numbered on the page; the JSON file lists all."""
 
@@ -97,8 +87,7 @@ def write_change(
         title=title,
         summary=[line for line in change.lines() if not line.startswith("warning: ")],
         warnings=change.warnings,
-        columns=_COLUMNS,
-        regions=_rows(change)[:_MOST_ROWS],
+        regions=change.regions()[:_MOST_ROWS],
         more=max(len(change.regions()) - _MOST_ROWS, 0),
         map=_map(change),
         histogram=_histogram(change),
@@ -132,22 +121,6 @@ def _colours(change: SurfaceChange) -> np.ndarray:
     for where, colour in ((~change.significant, _NOT_SIGNIFICANT), (~change.compared, UNKNOWN)):
         colours[where] = np.rint(255 * np.array(to_rgb(colour)))
     return colours
-
-
-def _rows(change: SurfaceChange) -> list[tuple[str, ...]]:
-    return [
-        (
-            str(number),
-            " ".join(f"{value:.1f}" for value in region.centre_mm),
-            f"{region.area_mm2:.1f}",
-            f"{region.extent_mm:.1f}",
-            f"{region.largest_mm:+.3f}",
-            f"{region.mean_mm:+.3f}",
-            f"{region.level_mm:.3f}",
-            f"{region.volume_mm3:+.1f}",
-        )
-        for number, region in enumerate(change.regions(), start=1)
-    ]
 
 
 def _map(change: SurfaceChange) -> str:
