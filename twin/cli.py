@@ -4,7 +4,9 @@ Each command calls a function of `twin`; its options, defaults and help texts ar
 """
 
 import sys
-from typing import Any
+from typing import Annotated, Any
+
+from cyclopts import Parameter
 
 import twin
 from uwlts.errors import CommandFailed
@@ -76,17 +78,22 @@ def sweep(call: Call) -> None:
     show(call().lines())
 
 
+_CAMERAS = "Print image sensors and lenses that exist, with their sources, as choices to copy into a study."
+
+
 @app.command(group=JOBS["Design"])
-def scenes() -> None:
+def scenes(*, cameras: Annotated[bool, Parameter(negative="", help=_CAMERAS)] = False) -> None:
     """List scenes, sensors, campaigns, data sets, studies and their figures, waters, and window materials.
 
     Example: twin scenes
     """
     from twin.design.figures_of_merit import FIGURES
     from twin.scene.description import load_scene
-    from uwlts.model.library import list_names
+    from uwlts.model.library import library_folder, list_names
     from uwlts.model.media import GLASSES, WATERS
 
+    if cameras:
+        return say((library_folder() / "parts" / "cameras.toml").read_text(encoding="utf-8"))
     for name in list_names():
         scene = load_scene(name)
         say(f"{name:24s} {scene.title}; placements: {', '.join(scene.placements)}")

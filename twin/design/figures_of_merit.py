@@ -16,6 +16,7 @@ from twin.design.sensor_arrays import Follow, SensorArrays, compute_adjustments
 from twin.scene.platform_kinds import GRAVITY_M_S2
 from twin.sensor.detector import PLANCK_TIMES_LIGHT
 from uwlts.optics.design import (
+    SAFETY_FACTOR,
     Array,
     ImagePoints,
     SheetGeometry,
@@ -327,6 +328,7 @@ class Figures:
     speckle_limit_mm: np.ndarray = _figure("speckle limit of Z")  # Dorsch's, in the middle, for depolarised light
     laser_class: np.ndarray = _figure("laser class", "")  # number after IEC 60825-1, see `CLASS_NAMES`, `laser_class`
     window_mm: np.ndarray = _figure("window thickness needed")  # for the pressure at the study's depth
+    window_safety: np.ndarray = _figure("safety factor of the windows", "")  # of the weaker one, at the study's depth
     baseline_mm: np.ndarray = _figure("width of the sensor")
 
 
@@ -451,6 +453,10 @@ def _reduce_fields(p: SensorArrays, f: dict[str, np.ndarray], share: np.ndarray,
     per_depth = rms(f["sigma_z_mm"], inside)
     line = np.where(inside.any(axis=2), 2 * f["half_line_mm"][:, :, 0], 0.0)
     at, pose = (slice(None), middle, PLACES // 2), p.pose(np)
+    thick, needed = (
+        (p.window_thickness_mm, p.laser_window_thickness_mm),
+        windows_needed_mm(p, water_depth_m=water_depth_m),
+    )
     speckle_px = p.speckle_coherence / math.sqrt(2) * p.wavelength_mm * p.working_f_number() / math.pi / p.pixel_mm
     return Figures(
         **{name: worst(name) for name in ("sigma_y_mm", "sigma_z_mm", "stripe_px", "blur_px", "centre_px")},
@@ -475,7 +481,10 @@ def _reduce_fields(p: SensorArrays, f: dict[str, np.ndarray], share: np.ndarray,
         signal_e=np.where(inside, f["signal_e"], np.inf).min(axis=(1, 2)),
         speckle_limit_mm=one(speckle_px) * f["depth_per_px_mm"][at],
         laser_class=one(laser_class(p)),
-        window_mm=one(window_needed_mm(p, water_depth_m=water_depth_m)),
+        window_mm=one(needed[0]),
+        window_safety=one(
+            SAFETY_FACTOR * np.minimum(*((t / least) ** 2 for t, least in zip(thick, needed, strict=True)))
+        ),
         baseline_mm=one(np.hypot(*pose.origin[:2])),
     )
 
@@ -553,13 +562,18 @@ def laser_class(p: SensorArrays) -> np.ndarray:
     return np.sum([power > limit for limit in limits], axis=0) + 1
 
 
-def window_needed_mm(p: SensorArrays, *, water_depth_m: float) -> np.ndarray:
-    """Return the thickness of a clamped round window of the camera's glass.
+def windows_needed_mm(p: SensorArrays, *, water_depth_m: float) -> list[np.ndarray]:
+    """Return the thicknesses of the clamped round windows of camera and laser.
 
     The strength is that of the named glass, or of fused silica if it is unknown.
     """
     pressure_mpa = 1e-6 * GRAVITY_M_S2 * _WATER_KG_PER_M3 * water_depth_m
-    opening = np.where(np.isfinite(p.window_aperture_mm), p.window_aperture_mm, 0.0)
-    return window_thickness_mm(
-        pressure_mpa=pressure_mpa, unsupported_diameter_mm=opening, strength_mpa=p.window_strength_mpa
-    )
+    windows = (p.window_aperture_mm, p.window_strength_mpa), (p.laser_window_aperture_mm, p.laser_window_strength_mpa)
+    return [
+        window_thickness_mm(
+            pressure_mpa=pressure_mpa,
+            unsupported_diameter_mm=np.where(np.isfinite(aperture), aperture, 0.0),
+            strength_mpa=strength,
+        )
+        for aperture, strength in windows
+    ]

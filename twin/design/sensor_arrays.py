@@ -100,6 +100,7 @@ class SensorArrays:
     window_absorption_per_mm: Array
     window_aperture_mm: Array
     window_strength_mpa: Array
+    laser_window_strength_mpa: Array
     wavelength_mm: Array
     power_w: Array
     fan_half_rad: Array
@@ -319,7 +320,6 @@ def extract_numbers(sensor: Sensor, medium: Medium) -> SensorArrays:
         "ambient_w_per_mm2": 1e-6 * sensor.lamp.ambient_w_per_m2,
         "speckle_coherence": speckle,
         "stage_resolution_mm": sensor.stage.resolution_mm,
-        "window_strength_mpa": window.strength_mpa() or FUSED_SILICA_MPA,
     }
     for name, one in (("window", window), ("laser_window", laser.window)):
         glass = one.index(wavelength) if one.mounted else 1.0
@@ -329,6 +329,7 @@ def extract_numbers(sensor: Sensor, medium: Medium) -> SensorArrays:
             f"{name}_index": glass,
             f"{name}_faces_pass": faces,
             f"{name}_absorption_per_mm": one.absorption_per_mm() if one.mounted else 0.0,
+            f"{name}_strength_mpa": one.strength_mpa() or FUSED_SILICA_MPA,
             f"{name}_aperture_mm": one.aperture_diameter_mm if one.mounted else math.inf,
         }
     # Power per rad, normalised to the integral 1.

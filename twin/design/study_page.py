@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
-from markupsafe import Markup
 from matplotlib.figure import Figure
 from plotly.subplots import make_subplots
 
@@ -143,7 +142,6 @@ def _mark(one: HighlightedDesign, number: int, x: str, y: str, *, chosen: bool) 
         showlegend=False,
         marker={"symbol": _SYMBOLS[number % len(_SYMBOLS)], "size": 12, "color": colour},
         text=[f"<b>{_escaped(one.label)}</b>"],
-        textposition="top left" if number % 2 else "top right",
         hovertemplate="%{text}<extra></extra>",
     )
 
@@ -206,13 +204,20 @@ def pareto_chart(judged: StudyResults, marked: Sequence[HighlightedDesign]) -> I
             add(name, places, mode="markers", marker={"color": colour, "opacity": 0.55})
     order = np.flatnonzero(front)[np.argsort(values[front, 0])]
     add(f"Pareto front ({len(order):,} of the designs)", order, mode="lines+markers", line={"color": COLOURS[2]})
-    for number, one in enumerate(marked):
-        if all(math.isfinite(one.design.number_of(name)) for name in (x, y)):
-            figure.add_trace(_mark(one, number, x, y, chosen=one is marked[-1]).update(mode="markers+text"))
+    logarithmic = []
     for axis, name in ((figure.update_xaxes, x), (figure.update_yaxes, y)):
         numbers = np.append(judged.figure(name)[known], [one.design.number_of(name) for one in marked])
         wide = 0 < np.nanmin(numbers) * _WIDE_RANGE < np.nanmax(numbers)
         axis(title_text=_escaped(tables.label_of(name)), type="log" if wide else "linear")
+        logarithmic.append(wide)
+    for number, one in enumerate(marked):
+        at = [one.design.number_of(name) for name in (x, y)]
+        if all(map(math.isfinite, at)):
+            figure.add_trace(_mark(one, number, x, y, chosen=one is marked[-1]))
+            # Beside the points, and opaque before them; places on a logarithmic axis are exponents.
+            across, along = (math.log10(value) if log else value for value, log in zip(at, logarithmic, strict=True))
+            label = {"text": _escaped(one.label), "bgcolor": "rgba(255,255,255,0.9)", "bordercolor": INK}
+            figure.add_annotation(x=across, y=along, ax=70, ay=-40 - 34 * number, **label)
     figure.update_layout(template="plotly_white", height=520, legend={"orientation": "h", "y": -0.16})
     better = " and ".join(
         f"{'less' if sign > 0 else 'more'} {tables.words_of(name)}" for name, sign in ((x, x_sign), (y, y_sign))
@@ -256,11 +261,6 @@ def sample(candidates: np.ndarray, kept: np.ndarray, most: int) -> np.ndarray:
 
 
 _BEST = 20  # designs in the table of the best
-_DRAWN = (
-    "Along the sheet, lengths in mm; near, far and stand-off are measured from the window. The camera's view is blue, "
-    "the sheet red (thick: in the camera's view and in the tinted measuring volume). Windows and rays are to scale; "
-    "the housings are only indicated."
-)
 
 
 def page_text(
@@ -279,16 +279,21 @@ def page_text(
     Raises EvaluationError if the columns belong to another study.
     """
     judged, collected = StudyResults(study, columns), FigureCollector()
+    views = [drawing.make_view(one.sensor, study.medium_of(one.sensor)) for one in (marked[-1], *marked[:-1][:1])]
     return render_page(
         "twin.design",
         "study_page.html.j2",
         interactive=collected,
         title=study.title,
-        introduction=tables.introduction(judged),
+        judged=judged,
+        bounds=[tables.bound_text(*bound) for bound in study.bounds()],
+        free=[tables.range_text(name, variable) for name, variable in study.free().items()],
+        words=tables.words_of,
         notes=list(notes),
         label=marked[-1].label,
         chosen=tables.tiles(study, marked[-1], marked[0] if len(marked) > 1 else None),
-        drawing=_drawing(study, marked),
+        drawing=figure_svg(drawing.draw(*views)),
+        behind=marked[0].label if len(views) > 1 else "",
         over_free=collected.add(*figures_chart(judged, marked)),
         pareto=collected.add(*pareto_chart(judged, marked)),
         number=tables.number_text,
@@ -298,31 +303,40 @@ def page_text(
             for found in agreements
             for drawn in [verification_chart(found)]
         ],
-        best=_best(judged),
+        best=_rows_of(judged, judged.best_first[:_BEST]),
+        best_of_each=best_of_each(judged),
         failures=tables.failure_counts(judged),
         misses=tables.miss_counts(judged),
         working=int(judged.works.sum()),
     )
 
 
-def _drawing(study: Study, marked: Sequence[HighlightedDesign]) -> tuple[Markup, str]:
-    """Return the drawing of the chosen design, the base sensor behind it, and its caption."""
-    views = [drawing.make_view(one.sensor, study.medium_of(one.sensor)) for one in (marked[-1], *marked[:-1][:1])]
-    behind = f" Dashed grey behind, as far as it fits in: {marked[0].label}." if len(views) > 1 else ""
-    return figure_svg(drawing.draw(*views)), _DRAWN + behind
+def best_of_each(judged: StudyResults) -> tuple[list[str], list[list[str]]] | None:
+    """Return the best design for each combination of choices, such as camera, window and water; None without choices.
+
+    Media come first: they are conditions of the use.
+    """
+    values = {name: one.values for name, one in judged.study.free().items() if one.values and len(one.values) > 1}
+    chosen = sorted(values, key=lambda name: not name.startswith("media."))
+    found: dict[tuple[int, ...], int] = {}
+    for place in judged.best_first.tolist():
+        found.setdefault(tuple(values[name].index(judged.columns[name][place]) for name in chosen), place)
+    return _rows_of(judged, [found[each] for each in sorted(found)][: 3 * _BEST], first=chosen) if chosen else None
 
 
-def _best(judged: StudyResults) -> tuple[list[str], list[list[str]]]:
-    """Return the head and rows of the table of the best designs."""
+def _rows_of(
+    judged: StudyResults, places: Sequence[int] | np.ndarray, *, first: Sequence[str] = ()
+) -> tuple[list[str], list[list[str]]]:
+    """Return the head and rows of a table of designs, with the ``first`` names in the first columns."""
     study = judged.study
     more = ("sigma_z_rms_mm", "line_mm", "depth_mm", "standoff_mm", "required_ms", "laser_class", "scattering_depth")
     figures = dict.fromkeys([*study.figures(), *more])
-    names = list(dict.fromkeys([*study.free(), *(name for name in figures if name in judged.columns)]))
+    names = list(dict.fromkeys([*first, *study.free(), *(name for name in figures if name in judged.columns)]))
     missed = not judged.feasible.any()
     rows = [
         [str(judged.columns["design"][place])]
         + [tables.format_design_value(judged, name, place, unit=False) for name in names]
         + ([f"{judged.figure('violation')[place]:.3g}"] if missed else [])
-        for place in judged.best_first[:_BEST]
+        for place in places
     ]
     return ["design", *map(tables.label_of, names), *(["constraints missed by"] if missed else [])], rows

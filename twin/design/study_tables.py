@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -15,8 +15,7 @@ from twin.design.figures_of_merit import CLASS_NAMES, FIGURES, RENDERED_SCATTERI
 from twin.design.study import Study, Variable
 from twin.design.verification import Agreement
 from twin.scene.description import Value
-from uwlts.model.media import FUSED_SILICA_MPA, GLASSES
-from uwlts.model.sensor import Window
+from uwlts.optics.design import SAFETY_FACTOR
 from uwlts.pages.toolkit import Tile
 
 MISSING = "\N{EN DASH}"
@@ -56,6 +55,8 @@ def words_and_unit(name: str) -> tuple[str, str]:
     *parents, key = name.split(".")
     if not parents:
         return key.replace("_", " "), ""
+    # A medium is known by its name alone, and named waters by their medium's.
+    parents = [each for each in parents if each not in ("media", key)]
     ending = next((ending for ending in _UNITS if key.endswith(ending)), "")
     words, unit = _WHOLE.get(key, (key.removesuffix(ending), _UNITS.get(ending, "")))
     return " ".join([*parents, words]).replace("_", " "), unit
@@ -86,6 +87,9 @@ def number_text(value: float | None, digits: int = 4) -> str:
     return text.replace("-", "\N{MINUS SIGN}")
 
 
+_SCATTER = ("sigma_", "speckle_limit", "centre_", "blur_")
+
+
 def value_text(name: str, value: Value | None, *, unit: bool = True) -> str:
     """Format the value of a figure or a free variable with its unit."""
     if isinstance(value, bool):
@@ -96,16 +100,11 @@ def value_text(name: str, value: Value | None, *, unit: bool = True) -> str:
         return CLASS_NAMES.get(round(value), MISSING)
     if name == "coverage" and math.isfinite(value):
         return f"{100 * value:.0f} %"
-    # Three digits of values below 0.01 are as wide as four of others, so that they fit in a tile.
-    text, of = number_text(value, 3 if abs(value) < 0.01 else 4), words_and_unit(name)[1]
+    # Formulas and rendered scatter differ by up to some 10 %: two digits.
+    text, of = number_text(value, 2 if name.startswith(_SCATTER) else 4), words_and_unit(name)[1]
     if not unit or not of or text == MISSING:
         return text
     return text + (of if of == "°" else "\N{NO-BREAK SPACE}" + of)
-
-
-def join_words(words: Sequence[str]) -> str:
-    """Join words as "a, b and c"."""
-    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
 def round_for_json(values: Iterable[float]) -> list[float | None]:
@@ -158,38 +157,8 @@ def misses(study: Study, row: Mapping[str, Value | None]) -> dict[str, str]:
     }
 
 
-_CHOSEN = {
-    "grid": "all of a grid",
-    "random": "drawn at random",
-    "sobol": "by a Sobol sequence",
-    "optimise": "proposed by an optimiser (NSGA-II)",
-}
-_GOALS = {"minimise": "smallest", "maximise": "largest"}
-_FOLLOW = {
-    "focus": "the lens is focused on it",
-    "waist": "the laser is focused on it",
-    "volume": "the volume is centred on it",
-}
-
-
-def introduction(judged: StudyResults) -> list[tuple[str, str]]:
-    """Return the study's question and the number of evaluated designs, as pairs of keyword and text."""
-    study, bounds = judged.study, judged.study.bounds()
-    facts = [
-        ("base sensor", f"{study.sensor.name}, in {study.medium}, on surfaces of reflectance {study.reflectance:g}"),
-        ("free", "; ".join(_range_text(name, variable) for name, variable in study.free().items())),
-        ("wanted", "; ".join(f"{_GOALS[wanted.goal]} {words_of(wanted.figure)}" for wanted in study.objectives)),
-    ]
-    if bounds:
-        facts.append(("constraints", "; ".join(bound_text(*bound) for bound in bounds)))
-    if study.follow:
-        facts.append(("at each stand-off", join_words([_FOLLOW[name] for name in study.follow])))
-    counted = f"{len(judged):,} evaluated, {_CHOSEN[study.sampling.kind]}; {judged.works.sum():,} work"
-    facts.append(("designs", counted + (f", {judged.feasible.sum():,} meet all constraints" if bounds else "")))
-    return facts
-
-
-def _range_text(name: str, variable: Variable) -> str:
+def range_text(name: str, variable: Variable) -> str:
+    """Format the values of a free variable."""
     if variable.values is not None:
         return f"{words_of(name)} ({', '.join(value_text(name, value) for value in variable.values)})"
     scale = ", logarithmic" if variable.scale == "log" else ""
@@ -209,7 +178,9 @@ def tiles(study: Study, chosen: HighlightedDesign, compared: HighlightedDesign |
     """
     row, missed = chosen.design.table(), misses(study, chosen.design.table())
     label, other = ("", {}) if compared is None else (compared.label, compared.design.table())
-    window, needed = chosen.sensor.camera.window, chosen.design.number_of("window_mm")
+    factor, needed = chosen.design.number_of("window_safety"), value_text("window_mm", row.get("window_mm"))
+    weak = f" – less than {SAFETY_FACTOR:g}, too thin" if factor < SAFETY_FACTOR else ""
+    window = f"at {study.water_depth_m:g} m; the camera's window needs {needed}{weak}"
 
     def tile(name: str, *, accent: bool = False, note: str = "") -> Tile:
         text, beside = value_text(name, row.get(name)), value_text(name, other.get(name))
@@ -224,32 +195,23 @@ def tiles(study: Study, chosen: HighlightedDesign, compared: HighlightedDesign |
 
     objectives = [objective.figure for objective in study.objectives]
     others = [name for name in dict.fromkeys([*_ALWAYS_SHOWN, *study.constraints]) if name not in objectives]
-    found = [tile(name, accent=True) for name in study.free()]
+    found = [
+        tile(name, accent=True, note="at the end of its range: widen it" if _is_at_end(one, row[name]) else "")
+        for name, one in study.free().items()
+    ]
     found += [tile(name, accent=True, note="an objective") for name in objectives]
     found += [tile(name) for name in others]
     needs, used = (chosen.design.number_of(name) for name in ("required_ms", "exposure_ms"))
     darker = f"required for the wanted brightness: {value_text('required_ms', needs)}" if needs > 1.001 * used else ""
-    last = (("exposure_ms", darker), ("laser_class", "estimate, IEC 60825-1"))
+    last = (("exposure_ms", darker), ("laser_class", "estimate, IEC 60825-1"), ("window_safety", window))
     found += [tile(name, note=note) for name, note in last if name not in (*objectives, *others)]
-    if "window_mm" not in objectives:
-        thin = " – too thin" if window.strength_mpa() and needed > window.thickness_mm else ""
-        note = f"{value_text('window_mm', needed)} needed at {study.water_depth_m:g} m{thin}"
-        note = f"{note}\n{_by_material(window, needed)}" if window.mounted else ""
-        text = value_text("window_mm", window.thickness_mm) if window.mounted else "none"
-        found.append(Tile("camera's window", text, note))
     return found
 
 
-def _by_material(window: Window, needed_mm: float) -> str:
-    """Return the thicknesses of other materials that replace a window which needs a thickness."""
-    own = window.strength_mpa() or FUSED_SILICA_MPA
-    texts = (
-        f"{value_text('window_mm', needed_mm * math.sqrt(own / glass.strength_mpa))} of {name}"
-        for name, glass in GLASSES.items()
-        if glass.strength_mpa is not None
-    )
-    unknown = ", ".join(name for name, glass in GLASSES.items() if glass.strength_mpa is None)
-    return f"by material: {', '.join(texts)}; unknown for {unknown}"
+def _is_at_end(variable: Variable, value: Value | None) -> bool:
+    """Return whether a value is within 0.1 % of a range from one of its ends."""
+    ends = () if variable.values is not None or isinstance(value, str | None) else variable.ends()
+    return any(abs(float(value) - end) <= 1e-3 * (ends[1] - ends[0]) for end in ends)
 
 
 def agreement_text(study: Study, found: Agreement) -> str:

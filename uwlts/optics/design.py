@@ -454,15 +454,18 @@ def speckle_limit_um(*, wavelength_nm: float, focal_length_mm: float, f_number: 
     return 1e-3 * DEPOLARISED_CONTRAST * wavelength_nm / (2 * math.pi * sine)
 
 
+SAFETY_FACTOR = 4.0  # of a window against fracture (thesis Eq. 3.2)
+
+
 def window_thickness_mm(*, pressure_mpa: Array, unsupported_diameter_mm: Array, strength_mpa: Array) -> Array:
     """Return the thickness of a clamped round window, t = A / 2 sqrt(K_w f_s dP / S_f) (Harris 1999, thesis Eq. 3.2).
 
-    A is ``unsupported_diameter_mm``, dP ``pressure_mpa``, S_f ``strength_mpa``, and the safety factor f_s is 4.
+    A is ``unsupported_diameter_mm``, dP ``pressure_mpa``, S_f ``strength_mpa``, and f_s is `SAFETY_FACTOR`.
 
     The thesis prints 5.53 mm for 1 MPa without A, K_w and S_f. Its Figure 34 lists only fused silica (60 MPa). With
     f_s = 4, the diameter A is then 49.5 mm. The bore of 63 mm would need 7.0 mm.
     """
-    return 0.5 * unsupported_diameter_mm * np.sqrt(_CLAMPED * 4.0 * pressure_mpa / strength_mpa)
+    return 0.5 * unsupported_diameter_mm * np.sqrt(_CLAMPED * SAFETY_FACTOR * pressure_mpa / strength_mpa)
 
 
 def line_needed_mm(*, pipe_diameter_mm: float, passes: int) -> float:

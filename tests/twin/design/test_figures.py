@@ -252,6 +252,10 @@ def test_the_window_for_the_pressure_is_that_of_equation_3_2(thesis):
     # Acrylic, also by a common name, is weaker than the fused silica that replaces an unknown material.
     acrylic = altered(thesis, {"camera": {"window": {"glass": "acrylic"}}})
     assert judged(acrylic).window_mm.item() == pytest.approx(expected * math.sqrt(60 / 41.4), rel=1e-12)
+    # 5.93 mm in front of 63 mm (camera) and 50 mm (laser): the wider one is weaker, in proportion to 1 / diameter^2.
+    assert judged(thesis).window_safety.item() == pytest.approx(4 * (5.93 / expected) ** 2, rel=1e-12)
+    thin = judged(altered(thesis, {"laser": {"window": {"thickness_mm": 4.0}}})).window_safety.item()
+    assert thin == pytest.approx(4 * (4.0 / (expected * 50 / 63)) ** 2, rel=1e-12)
 
 
 # --- designs that cannot work -----------------------------------------------------------------------------------------

@@ -25,7 +25,7 @@ from twin.design.designs import (
 from twin.design.drawing import make_view
 from twin.design.figures_of_merit import FIGURES
 from twin.design.study import Study, load_study
-from twin.design.study_page import choose_pareto_axes, figures_chart, page_text, pareto_chart, sample
+from twin.design.study_page import best_of_each, choose_pareto_axes, figures_chart, page_text, pareto_chart, sample
 from twin.design.study_tables import (
     agreement_text,
     label_of,
@@ -230,6 +230,8 @@ def test_every_figure_has_a_name_of_its_own():
         ("laser.beam_quality_m2", "laser beam quality M²"),
         ("sigma_z_rms_mm", "σ Z, rms over the volume (mm)"),
         ("my_camera", "my camera"),
+        ("media.water.water", "water"),
+        ("media.water.turbidity", "water turbidity"),
         ("detector.dark_current_e_per_s", "detector dark current (e⁻/s)"),
     ],
 )
@@ -246,6 +248,7 @@ def test_numbers_in_words():
         "0.00001",
         "250",
     ]
+    assert value_text("sigma_z_rms_mm", 0.03934, unit=False) == "0.039"
     assert value_text("laser_class", 4.0) == "3B"
     assert value_text("laser.triangulation_angle_deg", np.float64(35)) == "35°"
     assert round_for_json([1.2345678, math.inf, math.nan, 0.000123456]) == [1.2346, None, None, 0.00012346]
@@ -442,6 +445,24 @@ def test_a_page_where_nothing_meets_the_constraints():
     assert "No design meets all constraints: the front is that of all working designs." in page.text()
     assert "misses its bound: at least 200 % is required" in page.text()
     assert len(page.figures) == 2
+
+
+def test_each_combination_of_choices_has_its_best_design():
+    lens = {"f/4": {"camera.f_number": 4.0}, "f/8": {"camera.f_number": 8.0}}
+    waters = {"media.water.water": {"values": ["pure", "clear", "coastal"]}}
+    powers = {"laser.power_mw": {"least": 1, "most": 20, "steps": 4}}
+    study = small(variables=waters | powers, choices={"lens": lens}, follow=())
+    designs, columns = grid(study)
+    head, rows = best_of_each(StudyResults(study, columns))
+    assert head[:3] == ["design", "water", "lens"] and len(rows) == 6
+    assert [row[1:3] for row in rows] == [[w, f] for w in ("pure", "clear", "coastal") for f in ("f/4", "f/8")]
+    sigma = columns["sigma_z_rms_mm"]
+    for number, water, f, *_ in rows:
+        among = (columns["media.water.water"] == water) & (columns["lens"] == f)
+        assert sigma[columns["design"] == int(number)].item() == sigma[among & (columns["violation"] == 0)].min()
+    # The finest is that with the strongest laser, at the end of its range.
+    text = Page(page_text(study, columns, marked=marked_of(study, designs, columns), agreements=[])).text()
+    assert "Best for each choice" in text and "at the end of its range: widen it" in text
 
 
 def test_a_page_of_one_design():
