@@ -22,9 +22,9 @@ from uwlts.desk.desk_files import find_file, new_path
 from uwlts.desk.shown_state import Board
 from uwlts.errors import DescriptionError, Error, OutputError
 from uwlts.files.writing import refuse_unsuitable
-from uwlts.inspection.features import Inspection
+from uwlts.inspection.features import BLEMISHES, Inspection
 from uwlts.inspection.inspect import INSPECTIONS
-from uwlts.report.measured_values import judge_feature, load_order
+from uwlts.report.measured_values import judge_feature, load_order, sort_by_severity
 from uwlts.runtime.command_line import descriptions, option_type
 from uwlts.runtime.progress import ProgressListener
 from uwlts.runtime.workers import run_jobs
@@ -133,7 +133,9 @@ def _inspect(job: AnalysisJob, progress: ProgressListener) -> AnalysisOutcome:
     write_cloud(job.path("-coloured.ply"), cloud, colours=colours)
     order = load_order(job.values.get("order"))
     findings = []
-    for each in found.features:
+    # As in the report: flaws, the most severe first, then the object.
+    parts = sort_by_severity(list(found.select(*BLEMISHES)), order.limits)
+    for each in (*parts, *(one for one in found.features if one.kind not in BLEMISHES)):
         verdict = judge_feature(each, order.limits)[0]
         place = (float(each.place_mm[0]), float(each.place_mm[1]), float(each.place_mm[2]))
         values = tuple(f"{value.name} {format_interval(value)} {value.unit}" for value in each.values)

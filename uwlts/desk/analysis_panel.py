@@ -111,20 +111,20 @@ class AnalysisPanel:
     def _show_results(self, state: AnalysisState) -> None:
         if state.error:
             ui.label(state.error).classes("text-red-700 font-bold").props('role="alert"')
+        outcome = state.outcome or AnalysisOutcome(())
+        for finding in outcome.findings:
+            self._show_finding(finding)
         for name in state.files:
             with ui.row().classes("items-center gap-3"):
                 address = f"files/{quote(name)}"
                 ui.link(name, address).props("download").classes("font-mono break-all")
                 if name.endswith(".html"):
                     ui.link("open the report", address, new_tab=True)
-        if state.outcome is not None:
-            for line in state.outcome.lines:
-                ui.label(line).classes("text-xs font-mono whitespace-pre-wrap")
-            for finding in state.outcome.findings:
-                self._show_finding(finding)
+        for line in outcome.lines:
+            ui.label(line).classes("text-xs font-mono whitespace-pre-wrap")
 
     def _show_finding(self, finding: AnalysisFinding) -> None:
-        with ui.element("div").classes("finding w-full border-t pt-1"):
+        with ui.element("div").classes("finding w-full").props(f'data-verdict="{finding.verdict}"'):
             with ui.row().classes("items-center gap-2"):
                 ui.label(f"{finding.name}{f': {finding.verdict}' if finding.verdict else ''}").classes("font-bold")
                 x, y, z = finding.place_mm

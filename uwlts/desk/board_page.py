@@ -11,7 +11,7 @@ from nicegui import ui
 from nicegui.element import Element
 
 from uwlts.desk.shown_state import FIELDS, KEPT_LINES, Board, LaserState, Picture
-from uwlts.pages.cloud_figure import THREE, VIEW
+from uwlts.pages.cloud_figure import COLOURS, THREE, VIEW
 
 
 class NumberField(ui.number):
@@ -41,7 +41,7 @@ class BoardView:
 
     def __init__(self, board: Board, *, picked: Callable[[np.ndarray], None] | None = None):
         self._board, self._picked = board, picked
-        self._pictures, self._coverage, self._line = -1, b"", -1
+        self._pictures, self._coverage, self._line, self._named = -1, b"", -1, ""
         # Parts that some pages lack.
         self._cloud: CloudView | None = None
         self._map: ui.element | None = None
@@ -64,7 +64,7 @@ class BoardView:
         with ui.element("section").classes("image").props('aria-label="latest image"'):
             self._image = ui.element("img").props('alt="latest image"')
             self._image.set_visibility(False)
-            self._caption = ui.label("no image yet").classes("text-sm")
+            self._caption = ui.label("no image yet: connect a camera, then press lamp or laser").classes("text-sm")
             self._histogram = ui.html("", sanitize=False).classes("histogram")
 
     def coverage(self) -> None:
@@ -79,8 +79,8 @@ class BoardView:
         with ui.element("section").classes("cloud").props('aria-label="cloud"'):
             shown = self._cloud = CloudView(self._picked)
             with ui.row().classes("items-center px-2 py-1 gap-x-3 gap-y-0"):
-                colours = ui.select(["depth", *FIELDS], value="depth", label="colour").props("dense")
-                colours.classes("w-32").on_value_change(lambda event: shown.set_parameter("field", event.value))
+                self._colours = ui.select(["depth", *FIELDS], value="depth", label="colour").props("dense")
+                self._colours.classes("w-32").on_value_change(lambda event: shown.set_parameter("field", event.value))
                 ui.button("fit", on_click=shown.fit).props("flat dense")
                 self._count = ui.label().classes("text-sm")
 
@@ -119,6 +119,10 @@ class BoardView:
             self._cloud.set_parameter("closer", board.detail is not None)
             name = f"{board.cloud_name}: " if board.cloud_name else ""
             self._count.set_text(f"{name}{board.cloud.total:,} points")
+            if board.cloud_name != self._named:
+                # An inspected cloud is shown as in its report.
+                self._named = board.cloud_name
+                self._colours.set_value("deviation" if board.deviates else "depth")
         for line in board.lines(self._line):
             self._line = line.number
             kind = "" if line.kind == "note" else f"{line.kind}: "
@@ -178,7 +182,7 @@ class CloudView(Element, component=VIEW, esm={"nicegui-scene": str(THREE.parent)
 
     def __init__(self, picked: Callable[[np.ndarray], None] | None = None):
         super().__init__()
-        self._props |= {"field": "depth", "version": -1, "marks": [], "fit": 0, "closer": False}
+        self._props |= {"field": "depth", "version": -1, "marks": [], "fit": 0, "closer": False, "deviations": COLOURS}
         if picked is not None:
             self.on("pick", lambda event: picked(np.array(event.args["at"], float)))
 

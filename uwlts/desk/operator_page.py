@@ -159,7 +159,7 @@ class _Desk:
         self.measuring.open(cloud)
         self.board.detail = None
         self.board.cloud.clear()
-        self.board.cloud_name = name
+        self.board.cloud_name, self.board.deviates = name, cloud.deviation_mm is not None
         shown, total = cloud.select(slice(None, None, -(-len(cloud) // _MOST_SHOWN) or 1)), of or len(cloud)
         self.board.cloud.add(shown.points_mm, total, **_fields(shown))
         self.board.detail = closer if total > len(shown) else None

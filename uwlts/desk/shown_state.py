@@ -201,6 +201,7 @@ class Board:
     coverage: bytes | None = None
     cloud: ThinnedCloud = field(default_factory=ThinnedCloud)
     cloud_name: str = ""
+    deviates: bool = False  # whether the named cloud has deviations
     detail: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
     profile: FrameProfile | None = None
 

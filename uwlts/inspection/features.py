@@ -43,6 +43,10 @@ class FeatureKind(StrEnum):
     GAP = "gap"
 
 
+BLEMISHES = (FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION)
+"""Kinds of flaws, listed by their severity."""
+
+
 @dataclass(frozen=True)
 class Definition:
     """Definition of a value: unit, text, and the document that defines it or the quantity that it serves."""

@@ -44,6 +44,7 @@ STOPS = (
     (1.0, (170, 21, 40)),
 )
 """Colour scale of deviations: position between -1 and +1 limit (0 to 1), and red, green, blue."""
+COLOURS = [[place, [each / 255 for each in colour]] for place, colour in STOPS]  # as the script reads it
 
 LIMIT_STD = 2.0  # range of the deviation colours in standard deviations, as in the thesis
 
@@ -102,9 +103,7 @@ class CloudPoints:
                 "field": self.field,
                 "unit": self.unit,
                 "limits": None if self.limit is None else [-self.limit, self.limit],
-                "stops": None
-                if self.limit is None
-                else [[place, [each / 255 for each in colour]] for place, colour in STOPS],
+                "stops": None if self.limit is None else COLOURS,
                 "eye": (-view_direction()).tolist(),
             }
         )

@@ -32,11 +32,12 @@ export default {
         <div class="legend"><span>{{ high }}</span><div class="ramp"></div><span>{{ low }}</span><b>{{ legend }}</b></div>
         <div class="scale"><div class="bar"></div><span></span></div>
       </div>
-      <div class="empty" v-show="!count">{{ problem }}</div>
+      <div class="empty" :data-said="problem" v-show="!count">{{ problem }}</div>
     </div>`,
-  // Of a page: `source` of the points, `stops` of the colours, `limits` and `unit` of the field, direction of the `eye`.
+  // `deviations` are the colours of that field on the desk. Of a page: `source` of the points, `stops` of the colours, `limits` and `unit` of the field, direction of the `eye`.
   props: {
     field: String, version: Number, marks: Array, fit: Number, closer: Boolean, stops: Array, limits: Array,
+    deviations: Array,
     source: { type: Function, default: () => fetch("cloud") }, unit: { type: String, default: "mm" },
     eye: { type: Array, default: () => [-0.5, 0.35, -1] }, up: { type: Array, default: () => [1, 0, 0] },
   },
@@ -50,8 +51,6 @@ export default {
     }
     // Colours are shown without conversion.
     this.renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
-    const steps = Array.from({ length: 11 }, (_, k) => `rgb(${this.shade(k / 10).map((c) => 255 * c)})`);
-    this.$el.querySelector(".ramp").style.background = `linear-gradient(to top, ${steps})`;
     this.renderer.setClearColor(new THREE.Color().setRGB(0.06, 0.08, 0.11));
     this.scene = new THREE.Scene();
     // Orthographic, so that the scale holds at every depth.
@@ -59,10 +58,10 @@ export default {
     this.controls = new OrbitControls(this.camera, this.renderer.domElement);
     this.controls.addEventListener("change", () => { this.draw(); this.rest(); });
     this.controls.addEventListener("start", () => (this.touched = true));
-    const material = new THREE.PointsMaterial({ size: 2, sizeAttenuation: false, vertexColors: true });
+    this.material = new THREE.PointsMaterial({ size: 2, sizeAttenuation: false, vertexColors: true });
     [this.whole, this.near] = [0, 1].map(() => {
       const geometry = new THREE.BufferGeometry();
-      const points = new THREE.Points(geometry, material);
+      const points = new THREE.Points(geometry, this.material);
       points.frustumCulled = false;
       this.scene.add(points);
       return { geometry, table: new Float32Array(0), origin: [0, 0, 0], count: 0 };
@@ -184,9 +183,14 @@ export default {
     },
     column() { return { depth: 2, intensity: 3, deviation: 4, random: 5, common: 6 }[this.field] ?? 2; },
     // Turbo without its darkest end, which is invisible on a dark background.
-    shade(share) { return this.stops ? between(this.stops, limited(share)) : turbo(0.05 + 0.95 * limited(share)); },
+    shade(share) {
+      const stops = this.stops ?? (this.field === "deviation" ? this.deviations : null);
+      return stops ? between(stops, limited(share)) : turbo(0.05 + 0.95 * limited(share));
+    },
     colour() {
       if (!this.renderer) return;
+      const steps = Array.from({ length: 11 }, (_, k) => `rgb(${this.shade(k / 10).map((c) => 255 * c)})`);
+      this.$el.querySelector(".ramp").style.background = `linear-gradient(to top, ${steps})`;
       const column = this.column();
       const values = [];
       const table = this.whole.table;
@@ -266,6 +270,9 @@ export default {
     },
     draw() {
       if (!this.renderer) return;
+      // Points nearly touch, so that they look like a surface, also in a closer view.
+      const each = (0.5 * this.$el.clientWidth * this.$el.clientHeight) / (this.near.count || this.count || 1);
+      this.material.size = Math.min(10, Math.max(2, Math.sqrt(each) * (this.near.count ? 1 : this.camera.zoom)));
       this.renderer.render(this.scene, this.camera);
       this.showScale();
       this.showAxes();

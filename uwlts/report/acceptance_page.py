@@ -93,11 +93,9 @@ def _characteristic_row(each: Characteristic) -> tuple[str, ...]:
     value = MISSING if worst is None else format_fixed(worst.value_mm, 4, signed=each.symbol in _SIGNED)
     expanded = MISSING if worst is None or worst.expanded_mm is None else format_fixed(worst.expanded_mm, 4)
     place = MISSING if worst is None else f"{worst.position}, {worst.label}"
-    limit = each.limit_text() or MISSING
-    chance = each.probability_text() or MISSING
-    measured = f"{each.count}"
+    limit, chance = each.limit_text() or MISSING, each.probability_text() or MISSING
     name = f"{words}; {guideline}"
-    return each.symbol, each.decision_text(), value, expanded, limit, chance, place, measured, name
+    return each.symbol, each.decision_text(), value, expanded, limit, chance, place, f"{each.count}", name
 
 
 def _position_row(number: int, each: JudgedPosition, measured: Sequence[Symbol]) -> tuple[str, ...]:

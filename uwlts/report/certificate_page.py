@@ -134,10 +134,7 @@ def certificate_page(
         known_before=content.made_from.get("known_before", {}),
         parameters=_parameters(content.parameters, before),
         before=None if before is None else before[0],
-        equipment=[
-            (each.role, each.name, each.serial_number or MISSING, each.certificate or MISSING)
-            for each in (administration.equipment if administration is not None else ())
-        ],
+        equipment=administration.equipment if administration is not None else (),
         traceability=state_traceability(content, administration)[1],
         lengths=_length_rows(content.lengths) if isinstance(content, JointCertificate) else [],
         drawn=_pictures(content, calibration, before) if isinstance(content, JointCertificate) else {},

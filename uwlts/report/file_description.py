@@ -258,11 +258,14 @@ def cloud_lines(cloud: PointCloud) -> list[str]:
     if len(cloud) == 0:
         return ["cloud without points", *(f"{key}: {value}" for key, value in cloud.metadata.items())]
     low, high = cloud.points_mm.min(axis=0), cloud.points_mm.max(axis=0)
-    lines = [f"cloud of {len(cloud)} points from {len(np.unique(cloud.frame))} frames"]
+    lines = [f"cloud of {len(cloud):,} points from {len(np.unique(cloud.frame))} frames"]
     lines += [f"{axis}: {a:.3f} to {b:.3f} mm" for axis, a, b in zip("XYZ", low, high, strict=True)]
     if cloud.deviation_mm is not None and np.isfinite(cloud.deviation_mm).any():
         lines.append(f"deviation: standard deviation {np.nanstd(cloud.deviation_mm):.4f} mm")
-    return lines + [f"{key}: {value}" for key, value in cloud.metadata.items()]
+    return lines + [
+        f"{key}: {value:.4g}" if isinstance(value, float) else f"{key}: {value}"
+        for key, value in cloud.metadata.items()
+    ]
 
 
 def trajectory_lines(path: Trajectory) -> list[str]:

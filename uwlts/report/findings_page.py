@@ -19,6 +19,7 @@ from uwlts.evaluation.figures import VERDICTS, Figure
 from uwlts.files.json_files import EDITED, json_text
 from uwlts.files.writing import hash_file
 from uwlts.inspection.features import (
+    BLEMISHES,
     COVERAGE,
     COVERAGE_FACTOR,
     DEFINITIONS,
@@ -60,7 +61,6 @@ from uwlts.storage.cloud import PointCloud, compute_normal_std
 from uwlts.storage.cloud_files import load_cloud
 from uwlts.storage.number_tables import Unit
 
-_BLEMISHES = (FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION)
 _FIRST = ("depth", "height", "remaining wall")
 """Quantities in the first columns of the table of findings."""
 _MAIN = _FIRST[:2]  # quantities in the first column of sizes
@@ -268,8 +268,8 @@ def _page(
     title: str,
     made: datetime,
 ) -> str:
-    parts = [each for each in found.features if each.kind in _BLEMISHES]
-    whole = [each for each in found.features if each.kind not in (*_BLEMISHES, FeatureKind.SECTION, FeatureKind.HOLE)]
+    parts = [each for each in found.features if each.kind in BLEMISHES]
+    whole = [each for each in found.features if each.kind not in (*BLEMISHES, FeatureKind.SECTION, FeatureKind.HOLE)]
     repeated = [each for each in found.features if each.kind in (FeatureKind.SECTION, FeatureKind.HOLE)]
     limited = [each for each in whole if judge_feature(each, order.limits)[0] != "no limit"]
     parts, listed = (sort_by_severity(each, order.limits) for each in (parts, [*parts, *limited]))
@@ -484,7 +484,7 @@ def _picture(feature: Feature, found: Inspection, cloud: PointCloud) -> str:
     size = float(np.clip(25_000 / max(len(local), 1), 2, 40))
     colours = above.scatter(local[:, 0], local[:, 1], c=deviation, s=size, **_colour_scale(found))
     figure.colorbar(colours, ax=above, label="deviation / mm")
-    for other in found.select(*_BLEMISHES):
+    for other in found.select(*BLEMISHES):
         outline = (other.outline_mm - feature.place_mm) @ feature.axes.T
         shown = len(outline) > 0 and bool((np.abs(outline) < [*half, deep]).all(axis=1).any())
         if not shown:

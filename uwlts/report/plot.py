@@ -27,12 +27,7 @@ from uwlts.storage.cloud import PointCloud
 from uwlts.stripe import Stripe
 
 __all__ = ["cloud", "residuals", "stripe"]
-
-
-def __dir__() -> list[str]:
-    """Return the functions for programs, which notebooks offer."""
-    return __all__
-
+__dir__ = __all__.copy  # what notebooks offer
 
 DEVIATIONS = LinearSegmentedColormap.from_list(
     "deviations", [(place, (red / 255, green / 255, blue / 255)) for place, (red, green, blue) in STOPS]
