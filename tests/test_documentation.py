@@ -8,9 +8,12 @@ import tomllib
 import types
 from functools import cache
 from pathlib import Path
+from xml.etree import ElementTree
 
 import cyclopts
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import twin
 import uwlts
@@ -204,6 +207,18 @@ def test_all_commands_explain_themselves(app, capsys):
     for command in [name for name in app if not name.startswith("-")]:
         app([command, "--help"], exit_on_error=False, result_action="return_value")
         assert f"Usage: {app.name[0]} {command}" in capsys.readouterr().out
+
+
+def test_the_launch_file_calls_a_command_with_options_that_exist():
+    launch = ElementTree.parse(ROOT / "docs" / "how-to" / "uwlts.launch.xml").getroot()
+    defaults = {each.attrib["name"]: each.attrib["default"] for each in launch.iter("arg")}
+    (called,) = (each.attrib["cmd"] for each in launch.iter("executable"))
+    _check(re.sub(r"\$\(var (\w+)\)", lambda found: defaults[found[1]], called))
+    # Y of the points is to the right of a platform that moves along X with the sensor looking along -z.
+    (placed,) = (each.attrib["args"].split() for each in launch.iter("node"))
+    roll, pitch, yaw = (float(placed[placed.index(f"--{name}") + 1]) for name in ("roll", "pitch", "yaw"))
+    axes = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()
+    assert np.allclose(axes, np.diag([1, -1, -1]), atol=1e-6)
 
 
 def test_the_readme_and_how_to_pages_are_short():
