@@ -19,6 +19,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import cv2
 import numpy as np
 from pydantic import JsonValue
 
@@ -30,7 +31,7 @@ from twin.scene.description import Scene, Value, with_values
 from uwlts.errors import DesignError, Error
 from uwlts.files.json_files import write_model
 from uwlts.files.reading import log_warnings
-from uwlts.files.writing import hash_file
+from uwlts.files.writing import hash_file, write_atomically
 from uwlts.model.library import validate_description
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Sensor
@@ -201,7 +202,8 @@ def _apply_values(described: Described, values: dict[str, Value], source: str) -
 
 MOST_ATTEMPTS = 20
 """Largest number of draws of a scene until the sensor can measure it; more indicate an error in the description."""
-_OUTPUT = re.compile(rf"({'|'.join(SPLITS)})-\d{{6}}\.tar|{re.escape(CARD)}|{re.escape(PLAN)}")
+SHEET = "contact-sheet.png"
+_OUTPUT = re.compile(rf"({'|'.join(SPLITS)})-\d{{6}}\.tar|{re.escape(CARD)}|{re.escape(PLAN)}|{SHEET}")
 
 
 def dataset(
@@ -226,7 +228,7 @@ def dataset(
     description
         Name (see: twin scenes) or path of the data set's description.
     out
-        Folder for the data set: shards and dataset.json.
+        Folder for the data set: shards, dataset.json and a contact sheet.
     scenes
         Number of scenes; default: the description's.
     seed
@@ -288,8 +290,19 @@ def dataset(
     random.shuffle(waiting)
     run_jobs(_render_shard, waiting, workers=workers, on_message=count)
     if not (folder / CARD).is_file():
-        write_card(folder, described, [(job.path, job.split, job.frames) for job in jobs], plan)
+        card = write_card(folder, described, [(job.path, job.split, job.frames) for job in jobs], plan)
+        _write_sheet(folder / SHEET, DataSet(folder, card, None, ("image",)))
     return folder
+
+
+def _write_sheet(path: Path, samples: DataSet) -> None:
+    """Write a contact sheet of 12 frames, from the first to the last, with square roots of grey values."""
+    images = [samples[place]["image"] for place in np.linspace(0, len(samples) - 1, 12).astype(int).tolist()]
+    size, full = (320, round(320 * images[0].shape[0] / images[0].shape[1])), 2 ** samples.card.image["bits"] - 1
+    small = np.uint8([255 * cv2.resize(np.sqrt(one / full), size, interpolation=cv2.INTER_AREA) for one in images])
+    sheet = cv2.vconcat([cv2.hconcat(small[row : row + 4]) for row in (0, 4, 8)])
+    with write_atomically(path, overwrite=True) as aside:
+        aside.write_bytes(cv2.imencode(".png", sheet)[1].tobytes())
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ from pydantic import BaseModel
 from twin.experiments.detection import ProbabilityOfDetection
 from twin.experiments.figures import PublishedFigure, draw_means, select_means, state_agreement
 from twin.scene.campaign import Understated
-from uwlts._version import __version__
 from uwlts.files.json_files import write_model
 from uwlts.model.short_text import Brief, align_columns
 from uwlts.pages.cloud_display import choose_points
@@ -146,7 +145,6 @@ class ExperimentResult(Brief, BaseModel, frozen=True):
     def _page(self, clouds: Mapping[str, Path]) -> str:
         """Return a page with the uncertainties and errors, the probabilities of detection, and clouds."""
         count, collected, shown = len(self.seeds), FigureCollector(), []
-        water = [] if self.water is None else [("water", f"{self.water}")]
         for name, path in clouds.items():
             cloud = read_cloud(path)
             points = choose_points(cloud.points_mm, "deviation", cloud.field_values("deviation"), most=_MOST_POINTS)
@@ -157,14 +155,7 @@ class ExperimentResult(Brief, BaseModel, frozen=True):
             interactive=collected,
             sensor=Path(self.sensor).stem,
             verdict=f"{self.verdict()}, in {count} rendered campaign{'s' if count > 1 else ''}.",
-            introduction=[
-                ("sensor", self.sensor),
-                ("built as", self.as_built),
-                ("campaign", self.campaign),
-                *water,
-                ("seeds", " to ".join(dict.fromkeys(map(str, (self.seeds[0], self.seeds[-1]))))),
-            ],
-            understated=[each.text() for each in self.understated],
+            result=self,
             figure=figure_svg(draw_means(self.published) if self.published else self.errors_figure()),
             published_head=_PUBLISHED_HEAD,
             published=[each.texts() for each in self.published],
@@ -174,8 +165,6 @@ class ExperimentResult(Brief, BaseModel, frozen=True):
             curves=_draw_curves(self.detections) if self.detections else None,
             detection_head=_DETECTION_HEAD,
             detections=[*map(_detection_row, self.detections)],
-            validity=[*self.conditions.items()],
-            version=__version__,
         )
 
 
