@@ -5,7 +5,6 @@ from .calibration.calibrate import calibrate as calibrate
 from .calibration.camera.photographs import calibrate_camera as calibrate_camera
 from .calibration.mount.calibrate_mount import calibrate_mount as calibrate_mount
 from .calibration.polynomial.polynomial_calibration import calibrate_polynomials as calibrate_polynomials
-from .calibration.target_stripes import stripe_on_target as stripe_on_target
 from .comparison.change import compare_clouds as compare_clouds
 from .comparison.surface_mesh import mesh as mesh
 from .desk.scan import scan as scan
@@ -35,5 +34,4 @@ from .storage.cloud import PointCloud as PointCloud
 from .storage.export_ import export as export
 from .storage.import_.folder import import_images as import_images
 from .storage.mesh_file import SurfaceMesh as SurfaceMesh
-from .stripe import StripeOptions as StripeOptions, extract_stripe as extract_stripe
-from .targets import parse_target as parse_target
+from .stripe import StripeOptions as StripeOptions

@@ -132,7 +132,7 @@ def test_times_and_rotations_are_a_trajectory(tmp_path: Path, ending: str, names
 
 def test_results_are_short_texts():
     """Sizes in place of arrays: a screen has some 40 lines of 100 characters."""
-    evaluation = uwlts.evaluate(cloud_of(100), like={"kind": "plane"})
+    evaluation = uwlts.evaluate(cloud_of(100), {"kind": "plane"})
     sensor = uwlts.load_sensor("thesis")
     for result in (cloud_of(100_000), uwlts.nominal("thesis", medium="water"), sensor, evaluation):
         lines = repr(result).splitlines()
