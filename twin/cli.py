@@ -78,11 +78,10 @@ def sweep(call: Call) -> None:
     show(call().lines())
 
 
-_CAMERAS = "Print image sensors and lenses that exist, with their sources, as choices to copy into a study."
-
-
 @app.command(group=JOBS["Design"])
-def scenes(*, cameras: Annotated[bool, Parameter(negative="", help=_CAMERAS)] = False) -> None:
+def scenes(
+    *, cameras: Annotated[bool, Parameter(negative="", help="Print image sensors and lenses for studies.")] = False
+) -> None:
     """List scenes, sensors, campaigns, data sets, studies and their figures, waters, and window materials.
 
     Example: twin scenes

@@ -299,10 +299,10 @@ def _write_sheet(path: Path, samples: DataSet) -> None:
     """Write a contact sheet of 12 frames, from the first to the last, with square roots of grey values."""
     images = [samples[place]["image"] for place in np.linspace(0, len(samples) - 1, 12).astype(int).tolist()]
     size, full = (320, round(320 * images[0].shape[0] / images[0].shape[1])), 2 ** samples.card.image["bits"] - 1
-    small = np.uint8([255 * cv2.resize(np.sqrt(one / full), size, interpolation=cv2.INTER_AREA) for one in images])
+    small = [cv2.resize(np.sqrt(one / full), size, interpolation=cv2.INTER_AREA) for one in images]
     sheet = cv2.vconcat([cv2.hconcat(small[row : row + 4]) for row in (0, 4, 8)])
     with write_atomically(path, overwrite=True) as aside:
-        aside.write_bytes(cv2.imencode(".png", sheet)[1].tobytes())
+        aside.write_bytes(cv2.imencode(".png", (255 * sheet).astype(np.uint8))[1].tobytes())
 
 
 @dataclass(frozen=True)

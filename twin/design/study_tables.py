@@ -210,8 +210,8 @@ def tiles(study: Study, chosen: HighlightedDesign, compared: HighlightedDesign |
 
 def _is_at_end(variable: Variable, value: Value | None) -> bool:
     """Return whether a value is within 0.1 % of a range from one of its ends."""
-    ends = () if variable.values is not None or isinstance(value, str | None) else variable.ends()
-    return any(abs(float(value) - end) <= 1e-3 * (ends[1] - ends[0]) for end in ends)
+    least, most = (math.nan, math.nan) if variable.values is not None else variable.ends()
+    return isinstance(value, int | float) and min(value - least, most - value) <= 1e-3 * (most - least)
 
 
 def agreement_text(study: Study, found: Agreement) -> str:

@@ -430,8 +430,9 @@ def _make_maps(
     cells = [int(np.clip((high - low) / cell, 4, _MOST_CELLS)) for low, high in ends]
     every, own = (np.histogram2d(*at[:, some], bins=cells, range=ends)[0] > 0 for some in (slice(None), inspected))
     seen, (axes,) = new_figure(8.0, 1.9)
-    extent, states = (*ends[0], *ends[1]), (every.astype(int) + own).T
-    axes.imshow(states, cmap=ListedColormap(_SEEN), vmin=0, vmax=2, extent=extent, origin="lower")
+    (left, right), (low, high) = ends
+    states, how = (every.astype(int) + own).T, {"cmap": ListedColormap(_SEEN), "vmin": 0, "vmax": 2}
+    axes.imshow(states, extent=(left, right, low, high), origin="lower", **how)
     axes.set(xlabel=labels[0], ylabel=labels[1], aspect="auto")
     axes.grid(visible=False)
     whole = "circumference over the scanned length" if pipe else "rectangle around all points"
