@@ -55,6 +55,8 @@ def test_a_cloud_becomes_findings_a_report_and_exported_files(desk, page):
     page.get_by_role("alert").get_by_text("cancelled; nothing was written").wait_for()
     assert report.read_text(encoding="utf-8") == "mine"
     choose(page, "analysis", "export")
+    # The form before it has a cloud, too.
+    page.get_by_role("combobox", name="format", exact=True).wait_for()
     choose(page, "cloud", "plate.ply")
     choose(page, "format", ".xyz")
     page.get_by_label("name of the results").fill("for-others")
