@@ -1,6 +1,7 @@
 """Rules of the packages: permitted imports (contracts of import-linter), and unique class names."""
 
 import ast
+import re
 import shutil
 import subprocess
 import sys
@@ -147,6 +148,56 @@ def silent_numbers(source: str) -> list[str]:
         if name.isupper() and is_number and not commented and "#" not in lines[(node.end_lineno or node.lineno) - 1]:
             group.append(name)
     return [*silent, *group]
+
+
+REASON = re.compile(
+    r"\d|[`/;:]|\b(because|since|so that|than|as|otherwise|if|where|which|enough|would|could|may|cannot|needs?|chosen|"
+    r"beyond|reach(es|ed)?|one|two|three|four|five|half|third|quarter|tenth|hundred|thousand|million|twice)\b"
+)
+"""A reason, number, source or path in the text about a number."""
+MOST_WITHOUT_REASON = 400
+"""Named numbers whose texts only say what they are: 397 of 1,237 on 2026-11-30. Lower it; a new number has a reason."""
+
+
+def numbers_without_reason(source: str) -> list[str]:
+    """Named numbers of a module whose text, beside, below or above them, contains no reason."""
+    lines, body, found = source.splitlines(), ast.parse(source).body, []
+    for place, node in enumerate(body):
+        match node:
+            case ast.Assign(targets=[ast.Name(id=name)], value=value) | ast.AnnAssign(ast.Name(id=name), value=value):
+                pass
+            case _:
+                continue
+        is_number = isinstance(value, ast.Constant | ast.BinOp | ast.UnaryOp | ast.Tuple) and any(
+            isinstance(each, ast.Constant) and type(each.value) in (int, float) for each in ast.walk(value)
+        )
+        if not name.isupper() or not is_number:
+            continue
+        _, _, text = lines[node.end_lineno - 1].partition("#")
+        for below in body[place + 1 :] if not text else ():
+            if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant):
+                text = str(below.value.value)
+            if not isinstance(below, ast.Assign | ast.AnnAssign) or not lines[below.lineno - 2]:
+                break
+        for above in reversed(lines[: node.lineno - 1] if not text else []):
+            text += above if above.startswith("#") else ""
+            if not above:
+                break
+        if not REASON.search(text):
+            found.append(name)
+    return found
+
+
+def test_new_numbers_have_more_than_a_definition():
+    assert numbers_without_reason("A = 1\n\n# Size.\nB = 2\nC = 3\nD = 4  # size of D\n") == ["A", "B", "C", "D"]
+    assert numbers_without_reason('E = 5\n"""Size, so that no two touch."""\nF = 6  # more take 2 s\n') == []
+    found = [
+        (str(path.relative_to(ROOT)), name)
+        for package in ("twin", "uwlts")
+        for path in (ROOT / package).rglob("*.py")
+        for name in numbers_without_reason(path.read_text(encoding="utf-8"))
+    ]
+    assert 300 < len(found) <= MOST_WITHOUT_REASON, found
 
 
 def test_named_numbers_have_a_reason():
