@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from scipy.stats import median_abs_deviation
 
 from twin.design.designs import HighlightedDesign
 from twin.design.figures_of_merit import compute_figures, predict_scatter
@@ -42,7 +43,6 @@ _USER_ERROR = 2  # exit code of the commands for a mistake of the user
 _FEWEST_POINTS = 20  # of a profile, for its scatter to be known within a sixth
 _LARGEST_RESIDUAL = 5.0
 """Limit of residuals from the profile's trend in robust standard deviations; larger ones are outliers."""
-_MAD_TO_STD = 1.4826  # of normally distributed values
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,10 +159,9 @@ def _profile(points_yz: np.ndarray) -> tuple[float, float, float]:
     for _ in range(2):
         y, z = used.T
         trend = np.polynomial.Polynomial.fit(y, z, 2)
-        residuals = points_yz[:, 1] - trend(points_yz[:, 0])
-        centre = np.median(residuals)
-        spread = _MAD_TO_STD * np.median(np.abs(residuals - centre))
-        used = points_yz[np.abs(residuals - centre) <= _LARGEST_RESIDUAL * spread]
+        off = points_yz[:, 1] - trend(points_yz[:, 0])
+        off -= np.median(off)
+        used = points_yz[np.abs(off) <= _LARGEST_RESIDUAL * median_abs_deviation(off, scale="normal")]
     y, z = used.T
     residuals = z - np.polynomial.Polynomial.fit(y, z, 2)(y)
     return float(np.sqrt(residuals @ residuals / (len(y) - 3))), float(z.mean()), float(np.ptp(y))

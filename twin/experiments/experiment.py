@@ -104,9 +104,8 @@ def experiment(
         raise DescriptionError(f"{missing} is empty; an experiment needs at least one of them")
     options = RecordingOptions(every, spp, variant, workers, scheduler, overwrite)
     described = load_campaign(campaign)
-    folder = Path(
-        out or Path("runs") / f"experiment-{sensor.name if isinstance(sensor, Sensor) else Path(sensor).stem}"
-    )
+    name = sensor.name if isinstance(sensor, Sensor) else Path(sensor).stem
+    folder = Path(out or Path("runs") / f"experiment-{name}")
     evidence = [
         each
         for each in described.recordings

@@ -18,6 +18,7 @@ from typing import Any, get_type_hints
 
 import uwlts
 from uwlts.argument_types import protect_inputs
+from uwlts.comparison.change_reference import KINDS
 from uwlts.desk.desk_files import find_file, new_path
 from uwlts.desk.shown_state import Board
 from uwlts.errors import DescriptionError, Error, OutputError
@@ -56,7 +57,6 @@ _LABELS = {
     "pose_std_deg": "pose std, deg",
 }
 """Labels of fields whose parameters have no telling names."""
-SHAPES = ("plane", "sphere", "cylinder")  # ideal shapes, which a reference may be instead of a file
 _FORMAT = "format"  # field for the format of an export: the ending of its file
 
 
@@ -255,7 +255,7 @@ def list_fields(kind: str) -> list[AnalysisField]:
                     file_kind=_FILES.get(name, ""),
                     several=name in ("clouds", "passes"),
                     switch=option_type(hints[name]) is bool,
-                    choices=SHAPES if name == "reference" else (),
+                    choices=tuple(KINDS) if name == "reference" else (),
                 )
             )
     if kind == "export":

@@ -15,6 +15,7 @@ from uwlts.files.json_files import read_json
 from uwlts.files.reading import is_regular_file
 from uwlts.storage.calibration_file import FORMAT as CALIBRATION_FORMAT, POLYNOMIALS_FORMAT as POLYNOMIAL_FORMAT
 from uwlts.storage.cloud_files import is_cloud
+from uwlts.storage.foreign_clouds import FORMATS
 
 _SHOWN = 500  # the latest files; a longer list is not read
 _REMEMBERED = 4 * _SHOWN  # files whose description is kept
@@ -24,7 +25,7 @@ _KINDS = {
     ".truth.h5": "truth",
     ".ply": "cloud",
     ".h5": "capture",
-    **dict.fromkeys((".laz", ".las", ".xyz", ".e57", ".mcap"), "exported cloud"),
+    **{ending: "exported cloud" for ending, each in FORMATS.items() if each.write is not None},
     ".measured.json": "measured values",
     **dict.fromkeys((".findings.json", ".registration.json", ".recalibration.json", ".measured.csv"), "figures"),
     ".csv": "table",

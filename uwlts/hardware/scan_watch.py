@@ -15,6 +15,7 @@ from uwlts.hardware.rig import are_enough, get_stripe
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Seen
 from uwlts.stripe import Stripe, StripeStatus
+from uwlts.stripe.capture_stripes import FEWEST_LINES
 
 LOOKS = 9  # number of positions searched for a stripe before a scan is given up
 _SAME_PX = 1.0  # stripes of two images within this distance are the same; edges caused by noise are displaced more
@@ -35,8 +36,8 @@ def shows_laser(lit: Seen, unlit: Seen, sensor: Sensor, *, difference: bool) -> 
     """
     if isinstance(lit, Stripe) or isinstance(unlit, Stripe):
         with_laser, without = (select_centres(get_stripe(each, sensor)) for each in (lit, unlit))
-        own = np.isfinite(with_laser) & ~(np.abs(with_laser - without) < _SAME_PX)
-        return are_enough(int(own.sum()), len(own))
+        changed = np.isfinite(with_laser) & ~(np.abs(with_laser - without) < _SAME_PX)
+        return are_enough(int(changed.sum()), len(changed))
     full = sensor.detector.full_scale_dn()
     added = get_stripe(lit, sensor, background=unlit)
     shown = added.status == StripeStatus.OK
@@ -61,7 +62,6 @@ LARGEST_MM = 0.05  # largest slip that is not reported: four steps of 0.0125 mm,
 _LEAST_RELIEF = 0.2
 """Smallest motion of the stripe in px per mm of the stage on lines that are used; below it noise dominates."""
 _LARGEST_BEND_PX = 2.0  # a larger change of the motion between two images is caused by an edge
-_FEWEST_LINES = 20  # fewest lines for a median and its scatter
 _SIGMAS = 4.0  # a slip within this many standard errors is not reported: 6e-5 false alarms per scan
 _GRAIN = 2.0  # factor on the standard error of a mean, because neighbouring lines share their speckle
 
@@ -95,7 +95,7 @@ class SlipWatch:
         with np.errstate(invalid="ignore"):
             steep = (np.abs(motion) > _LEAST_RELIEF) & (np.abs(bend) < _LARGEST_BEND_PX)
         # The bend has six times the variance of a centre, and a slip twice that variance.
-        if steep.sum() >= _FEWEST_LINES and _standard_error(bend[steep] / np.sqrt(3), motion[steep]) <= LARGEST_MM / 3:
+        if steep.sum() >= FEWEST_LINES and _standard_error(bend[steep] / np.sqrt(3), motion[steep]) <= LARGEST_MM / 3:
             self.place, self._motion_px_per_mm = here, np.where(steep, motion, np.nan)
 
     def measure_slip(self, again: np.ndarray) -> tuple[float, float]:
@@ -104,17 +104,17 @@ class SlipWatch:
         Both are infinite if too few lines remain.
         """
         assert self.place is not None
-        away = again - self.place.centre_px
-        good = np.isfinite(away) & np.isfinite(self._motion_px_per_mm)
-        if good.sum() < _FEWEST_LINES:
+        shift = again - self.place.centre_px
+        good = np.isfinite(shift) & np.isfinite(self._motion_px_per_mm)
+        if good.sum() < FEWEST_LINES:
             return np.inf, np.inf
-        motion, away = self._motion_px_per_mm[good], away[good]
+        motion, shift = self._motion_px_per_mm[good], shift[good]
         # The weighted median is robust to lines that now show another stripe.
-        slips, weights = away / motion, np.abs(motion)
+        slips, weights = shift / motion, np.abs(motion)
         order = np.argsort(slips)
         heaped = np.cumsum(weights[order])
         slip_mm = float(slips[order][np.searchsorted(heaped, heaped[-1] / 2)])
-        return slip_mm, _standard_error(away - slip_mm * motion, motion)
+        return slip_mm, _standard_error(shift - slip_mm * motion, motion)
 
     def is_significant(self, slip_mm: float, error_mm: float) -> bool:
         """Return whether a slip exceeds `LARGEST_MM` and its uncertainty."""

@@ -414,3 +414,6 @@ def flange_face(flange: Flange, x: np.ndarray, y: np.ndarray, *, edges: bool = F
     for at_x, at_y in flange.hole_places():
         on &= np.hypot(x - at_x, y - at_y) >= flange.hole_diameter_mm / 2
     return np.where(on | edges, z, np.nan)
+
+
+Part = Flange | PittedPipe | Weld
