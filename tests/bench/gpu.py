@@ -35,11 +35,11 @@ def frame_seconds(water: str, samples_at_once: int) -> float:
     """Return the median seconds to render the light of one frame in parts of at most ``samples_at_once`` samples."""
     use_variant(GPU)
     from tests.bench.light import in_named_water
-    from twin.light import renderer as module
+    from twin.light import image_sampling, renderer as module
     from twin.rendering_options import Options
     from twin.scene.description import load_scene
 
-    module.SAMPLES_AT_ONCE = samples_at_once
+    image_sampling.SAMPLES_AT_ONCE = samples_at_once
     sensor, seconds = in_named_water(water), []
     renderer = module.Renderer(sensor, sensor.media["water"], load_scene("spheres"))
     for seed in range(WARM_UP + FRAMES):

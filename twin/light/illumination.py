@@ -24,13 +24,14 @@ from twin.light.camera import CameraView, RaySegment
 from twin.light.pose import CLEAR_MM, Rays, SensorPose
 from twin.light.sheet import Sheet, SheetLight
 from twin.light.water import AngleTable, Scattering, one_minus_cosine
-from twin.scene.objects import MirrorFace
+from twin.scene.objects import MirrorFace, Objects
 from twin.scene.platform_kinds import GRAVITY_M_S2
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Sensor
 
 _LARGEST_SLOPE = 0.7
 """Largest ratio of the distance from the sheet to the distance from the window that `SheetLobe` handles."""
+_SPOT_ASIDE = 0.25  # offset of an uneven lamp's axis from the camera's axis, as a fraction of the view's corner slope
 
 
 class Light:
@@ -38,7 +39,7 @@ class Light:
 
     def __init__(self, sheet: Sheet, pose: SensorPose, mirror: MirrorFace | None = None):
         self.sheet, self._pose, self.mirror = sheet, pose, mirror
-        self.power_w, own = opaque(sheet.power_w), sheet.own_from_object
+        self.power_w, transform = opaque(sheet.power_w), sheet.sheet_from_object
         if mirror is not None:
             object_from_face = np.linalg.inv(pose.scene_from_object) @ mirror.pose
             reflection = object_from_face @ np.diag([1.0, 1.0, -1.0, 1.0]) @ np.linalg.inv(object_from_face)
@@ -47,16 +48,16 @@ class Light:
             self._from_face = opaque_transform(object_from_face)
             self._half = mi.Vector2f(*(opaque(float(h)) for h in mirror.half_size_mm))
             self._share = opaque(mirror.share)
-        self._to_own = None if own is None else opaque_transform(own)
-        self._from_own = None if own is None else opaque_transform(np.linalg.inv(own))
+        self._to_sheet = None if transform is None else opaque_transform(transform)
+        self._from_sheet = None if transform is None else opaque_transform(np.linalg.inv(transform))
 
     def to_sheet_frame(self, origin: Point3f, direction: Vector3f) -> tuple[Point3f, Vector3f]:
         """Transform a ray from the sensor's OCS into the frame of the sheet, where the nominal sheet is X = 0."""
         if self.mirror is not None:
             origin, direction = self._reflection @ mi.Point3f(origin), self._reflection @ mi.Vector3f(direction)
-        if self._to_own is None:
+        if self._to_sheet is None:
             return origin, direction
-        return self._to_own @ mi.Point3f(origin), self._to_own @ mi.Vector3f(direction)
+        return self._to_sheet @ mi.Point3f(origin), self._to_sheet @ mi.Vector3f(direction)
 
     def evaluate(self, p: Point3f, after_s: Float | None = None) -> SheetLight:
         """Return the sheet's light at points in the sensor's OCS, without shadows; 0 where the mirror reflects none."""
@@ -78,10 +79,10 @@ class Light:
 
     def _evaluate_direct(self, p: Point3f) -> SheetLight:
         """Return the light of the sheet without mirrors at points in the OCS."""
-        if self._to_own is None:
+        if self._to_sheet is None:
             return self.sheet.evaluate(p)
-        light = self.sheet.evaluate(self._to_own @ mi.Point3f(p))
-        return replace(light, direction=self._from_own @ light.direction, normal=self._from_own @ light.normal)
+        light = self.sheet.evaluate(self._to_sheet @ mi.Point3f(p))
+        return replace(light, direction=self._from_sheet @ light.direction, normal=self._from_sheet @ light.normal)
 
     @property
     def mirrored(self) -> bool:
@@ -126,9 +127,9 @@ class Light:
     def sample_rays(self, u: Point3f) -> tuple[Point3f, Vector3f]:
         """Sample origins and directions of a direct light's rays in the sensor's OCS, in proportion to power."""
         origin, direction = self.sheet.sample(u)
-        if self._from_own is None:
+        if self._from_sheet is None:
             return origin, direction
-        return self._from_own @ mi.Point3f(origin), self._from_own @ direction
+        return self._from_sheet @ mi.Point3f(origin), self._from_sheet @ direction
 
     def intersect(self, origin: Point3f, direction: Vector3f) -> tuple[Float, SheetLight]:
         """Intersect rays in the sheet's frame with its centre; return distances along them, and the light."""
@@ -218,8 +219,8 @@ class SheetLobe:
         side = mi.Vector3f(dr.normalize(side - towards * dr.dot(side, towards)))
         # Inside the sheet, scattered light arrives from both sides.
         share = 0.5 + 0.5 * dr.erf(across / (math.sqrt(2) * light.sigma_mm))
-        away = dr.sqrt(dr.square(across) + dr.square(light.sigma_mm))
-        return cls(towards, side, 0.5 * away / dr.maximum(light.exit_mm, 1e-3), share, angles)
+        distance = dr.sqrt(dr.square(across) + dr.square(light.sigma_mm))
+        return cls(towards, side, 0.5 * distance / dr.maximum(light.exit_mm, 1e-3), share, angles)
 
     def has_directions(self) -> Bool:
         """Return the mask of points whose lobe is not empty."""
@@ -227,7 +228,7 @@ class SheetLobe:
 
     def share_below(self, u: Float) -> Float:
         """Return the value of the table's cumulative distribution that ``u`` selects."""
-        return dr.lerp(self._excluded_share(), 1.0, u)
+        return dr.lerp(self._exclude_angles(), 1.0, u)
 
     def rotate_to_angles(self, heights: tuple[Float, Float], u: Float) -> tuple[Vector3f, Bool]:
         """Return directions at angles given by 1 - cos and 1 + cos, and the mask of valid ones.
@@ -251,13 +252,13 @@ class SheetLobe:
         before = one_minus_cosine(self.towards, direction)
         sine = dr.sqrt(dr.maximum(before * (2 - before), 0.0))
         slope = dr.dot(direction, self.side)
-        share = dr.select(slope > 0, self.share_on_side, 1 - self.share_on_side) / (1 - self._excluded_share())
+        share = dr.select(slope > 0, self.share_on_side, 1 - self.share_on_side) / (1 - self._exclude_angles())
         slope = dr.abs(slope)
         drawn = self.has_directions() & (sine > self.least) & (slope > (1 - 1e-3) * self.least)
         density = share * self.angles.density(before) * math.pi * sine / (slope * self._reach(sine))
         return dr.select(drawn, density, 0.0)
 
-    def _excluded_share(self) -> Float:
+    def _exclude_angles(self) -> Float:
         """Return the fraction of angles too small for any direction steeper than ``least``."""
         squared = dr.square(dr.minimum(self.least, _LARGEST_SLOPE))
         return self.angles.share_below(squared / (1 + dr.sqrt(1 - squared)))
@@ -312,9 +313,9 @@ def reflect_ring(view: CameraView, sensor: Sensor, *, reflectance: float) -> np.
     met = origin + direction * (dr.dot(mi.Vector3f(face - origin), normal) / towards)
     back = direction - normal * (2 * towards)
     ring = met + back * (-met.z / back.z)
-    away = dr.norm(mi.Vector2f(ring.x, ring.y))
+    distance = dr.norm(mi.Vector2f(ring.x, ring.y))
     cosine = dr.square(dr.square(chief.z))
-    seen = dr.select((away > inner) & (away < outer) & (back.z < 0), cosine * view.lens.irradiance_on_axis, 0.0)
+    seen = dr.select((distance > inner) & (distance < outer) & (back.z < 0), cosine * view.lens.irradiance_on_axis, 0.0)
     shares = dr.block_sum(seen, _PUPIL_SAMPLES).numpy().reshape(rows, columns) / _PUPIL_SAMPLES
     middle, area = 0.5 * (inner + outer), math.pi * (outer**2 - inner**2)
     distance_mm = float(camera_from_object(sensor)[2, 3])
@@ -490,3 +491,63 @@ def focus_light(along: np.ndarray, across: np.ndarray, *, depth_mm: float, index
         share = (right if beside else 1 - right) * (down if below else 1 - down)
         light += np.bincount(place.ravel(), share.ravel(), light.size)
     return light.reshape(count, count)
+
+
+@dataclass(frozen=True, eq=False)
+class EvenLight:
+    """Light of lamp and day on surfaces; the lamp loses the fraction ``uneven_lamp`` towards the image's corners."""
+
+    sensor: Sensor
+    view: CameraView
+    objects: Objects
+    scattering: Scattering
+    standoff_mm: float
+    haze: bool
+    uneven_lamp: float
+
+    def irradiance(self, segment: RaySegment, ambient: bool, pattern: Float | None) -> Float:
+        """Return the irradiance per ray in W/mm2 for evenly lit surfaces, seen through the water and its veiling light.
+
+        A surface of albedo A at the irradiance E has the radiance A E / pi. Daylight is isotropic, so the water
+        scatters the radiance E / pi into every ray. The lamp is beside the camera, so only backscattered light returns.
+        Up to the distance t, the veiling light is E / pi (1 - exp(-c t)) times the scattered fraction of the extinction
+        c (Duntley 1963, Eq. 4, for an even light field). ``pattern`` is that of focused daylight on surfaces.
+        """
+        lamp = self.sensor.lamp
+        level = opaque(1e-6 / math.pi * (lamp.ambient_w_per_m2 if ambient else lamp.irradiance_w_per_m2))
+        left = dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, dr.inf))
+        albedo = self.objects.albedo(segment.si) if ambient else self.objects.lamp_albedo(segment.si)
+        radiance = dr.select(segment.valid, albedo * left, 0.0)
+        if pattern is not None:
+            radiance *= _read_pattern(segment.si.p, pattern)
+        if self.haze and self.scattering.coefficient > 0:
+            scattered = self.scattering.coefficient * (1 if ambient else self.scattering.backward_share)
+            radiance += opaque(scattered / self.scattering.extinction) * (1 - left)
+        if self.uneven_lamp and not ambient:
+            radiance *= self._lamp_share(segment)
+        return segment.weight * level * radiance
+
+    def _lamp_share(self, segment: RaySegment) -> Float:
+        """Return the fraction of lamp light at the end of camera rays: a round Gaussian spot about the lamp's axis.
+
+        The fraction ``uneven_lamp`` is lost at the corner slope's distance from that axis.
+        """
+        length = dr.select(segment.valid, segment.si.t, self.standoff_mm)
+        x, y = self.view.slopes(mi.Point3f(segment.origin + segment.direction * length))
+        corner = self.sensor.camera.corner_slope()
+        squared = dr.square(x / corner - _SPOT_ASIDE) + dr.square(y / corner)
+        return dr.exp(math.log(1 - self.uneven_lamp) * squared)
+
+
+def _read_pattern(p: Point3f, pattern: Float) -> Float:
+    """Return the relative daylight at points of the scene: the pattern at X and Y, interpolated linearly."""
+    x, y = p.x * (CELLS / PATCH_MM), p.y * (CELLS / PATCH_MM)
+    left, top = dr.floor(x), dr.floor(y)
+
+    def read(beside: int, below: int) -> Float:
+        column, row = mi.Int32(left) + beside, mi.Int32(top) + below
+        # The number of cells is a power of two, so that the bits below it count periodically.
+        return dr.gather(mi.Float, pattern, mi.UInt32((row & (CELLS - 1)) * CELLS + (column & (CELLS - 1))))
+
+    above, below = (dr.lerp(read(0, row), read(1, row), x - left) for row in (0, 1))
+    return dr.lerp(above, below, y - top)

@@ -5,12 +5,23 @@ spaced along every axis: a smooth stripe is integrated as by the midpoint rule, 
 Lattice points are symmetric about the centre, so that few samples per pixel or pupil do not shift the image.
 """
 
+from __future__ import annotations
+
 import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import cache
 
 import cv2
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
+from twin.backend.arrays import Float, to_jit
+from twin.light.camera import CameraView
+from twin.light.pose import SensorPose
+
+SAMPLES_AT_ONCE = 2**23  # largest number of samples rendered together; this many take about 100 MB
 NODE_SPACING_PX = 2  # spacing of the rays of the coarse grid, and side length of its cells
 LIT_SIGMAS = 4.5  # the stripe is rendered up to this many standard deviations of the sheet, to 4e-5 of its peak
 _LARGEST_DISC = 24  # up to this radius in cells, dilation by a disc is faster than a distance transform
@@ -37,12 +48,12 @@ def make_lattice(count: int, axes: int) -> np.ndarray:
     # A step and its negative give the same points in reverse order.
     coprime = [k for k in range(1, count // 2 + 1) if math.gcd(k, count) == 1] or [1]
     spread = np.linspace(0, len(coprime) - 1, min(_CANDIDATES, len(coprime))).astype(int)
-    merit = np.prod([_kernel(index * step % count / count) for step in steps], axis=0)
+    merit = np.prod([_evaluate_kernel(index * step % count / count) for step in steps], axis=0)
     while len(steps) < axes:
         taken = {min(step, count - step) for step in steps}
         free = [coprime[k] for k in spread if coprime[k] not in taken] or coprime
-        steps.append(min(free, key=lambda k: merit @ _kernel(index * k % count / count)))
-        merit = merit * _kernel(index * steps[-1] % count / count)
+        steps.append(min(free, key=lambda k: merit @ _evaluate_kernel(index * k % count / count)))
+        merit = merit * _evaluate_kernel(index * steps[-1] % count / count)
     # An offset of half a step makes the lattice symmetric about the cube's centre. Steps must be odd: half an even step
     # would move points to the edges of their intervals. If the count is odd, either the step or its negative is odd.
     odd = [step if step % 2 else count - step for step in steps]
@@ -61,7 +72,7 @@ def pupil_shifts(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     return np.where(order < 8, shift, 1 - shift)[:, rows & 3, columns & 3]
 
 
-def _kernel(x: np.ndarray) -> np.ndarray:
+def _evaluate_kernel(x: np.ndarray) -> np.ndarray:
     return 1 + 2 * math.pi**2 * (x * x - x + 1 / 6)
 
 
@@ -119,6 +130,71 @@ def _dilate(marked: np.ndarray, radius: float) -> np.ndarray:
     """Return the mask of cells within a radius in cells of the nonzero cells of ``marked`` (uint8)."""
     if radius > _LARGEST_DISC:
         return cv2.distanceTransform(1 - marked, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) <= radius
-    away = np.arange(-int(radius), int(radius) + 1)
-    disc = np.square(away)[:, None] + np.square(away) <= radius**2
+    offsets = np.arange(-int(radius), int(radius) + 1)
+    disc = np.square(offsets)[:, None] + np.square(offsets) <= radius**2
     return cv2.dilate(marked, disc.view(np.uint8)) > 0
+
+
+@dataclass(frozen=True, eq=False)
+class PixelSampler:
+    """Rendering of pixels by samples over pixel, exposure and, with ``defocus``, the pupil."""
+
+    view: CameraView
+    defocus: bool
+
+    def render(
+        self,
+        light: Callable[..., tuple[Float, ...]],
+        pose: SensorPose,
+        rows: np.ndarray,
+        columns: np.ndarray,
+        *rest: object,
+        spp: int,
+        shifted: bool = False,
+    ) -> Callable[[], np.ndarray]:
+        """Render pixels; return a function that fetches the means (K, P) of ``light`` over pixel, pupil and exposure.
+
+        Rendering is asynchronous. ``shifted`` uses different pupil samples in neighbouring pixels, so that a blurred
+        edge shows no steps.
+        """
+        index = dr.arange(mi.UInt32, len(rows) * spp)
+        per_pixel = dr.opaque(mi.UInt32, spp)
+        pixel = index // per_pixel
+        sample = index - pixel * per_pixel
+        # Adjacent values are read together, which is much faster.
+        axes = make_lattice(spp, 2 + 2 * self.defocus + (pose.travel is not None))
+        places = np.zeros((spp, 4))
+        places[:, : 2 + 2 * self.defocus] = axes[: 2 + 2 * self.defocus].T
+        across, down, u, v = dr.gather(mi.Vector4f, to_jit(places), sample)
+        x, y = dr.gather(mi.Point2f, to_jit(np.stack([columns, rows], axis=1)), pixel)
+        pupil = None
+        if self.defocus:
+            if shifted:
+                shift_u, shift_v = dr.gather(mi.Point2f, to_jit(pupil_shifts(rows, columns).T), pixel)
+                u, v = u + shift_u, v + shift_v
+                u, v = u - dr.floor(u), v - dr.floor(v)
+            pupil = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(u, v))
+        after_s = None
+        if pose.travel is not None:
+            after_s = pose.travel.compute_times(y, dr.gather(mi.Float, to_jit(axes[-1]), sample))
+        bundle = self.view.trace_bundle(x + across - 0.5, y + down - 0.5, pupil)
+        values = light(pose, bundle, after_s, pixel, *rest)
+        dr.eval(values)  # together: separate sums would trace the rays again
+        sums = [dr.block_sum(value, spp) for value in values]
+        dr.eval(sums)
+        return lambda: np.stack([each.numpy() / spp for each in sums])
+
+    def blur_px(self, marked: np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
+        """Return the largest blur in px at the corners of marked cells, 0 elsewhere, from the depths at all nodes."""
+        row, column = find_marked(marked)
+        corners = np.stack([depth_mm[row + down, column + right] for down, right in np.ndindex(2, 2)])
+        blur = np.zeros(marked.shape, np.float32)
+        blur[row, column] = np.fmax(np.fmax.reduce(self.view.blur_radius_px(corners)), 0)
+        return blur
+
+
+def split_pixels(rows: np.ndarray, columns: np.ndarray, *, spp: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield pixels in parts of at most `SAMPLES_AT_ONCE` samples."""
+    if len(rows):
+        count = -(-len(rows) * spp // SAMPLES_AT_ONCE)
+        yield from zip(np.array_split(rows, count), np.array_split(columns, count), strict=True)

@@ -23,6 +23,7 @@ from twin.backend.arrays import Float, Vector3f, to_jit
 from twin.light.camera import CameraView
 from twin.light.illumination import Light
 from twin.light.pose import SensorPose, Travel
+from twin.rendering_options import Effects
 from twin.scene.objects import Objects
 
 Body = Literal["particles", "bubbles"]
@@ -69,35 +70,79 @@ class Spots:
         return image
 
 
-def sample_spots(
-    view: CameraView,
-    light: Light,
-    objects: Objects,
-    pose: SensorPose,
-    *,
-    travel: Travel | None,
-    body: Body,
-    per_litre: float,
-    extinction: Float,
-    wavelength_nm: float,
-    defocus: bool,
-    sparkle: bool,
-    rng: np.random.Generator,
-) -> Spots:
-    """Sample bodies in a light's sheet that the camera sees, without those behind, inside or shadowed by objects.
+@dataclass(frozen=True, eq=False)
+class SpotSampler:
+    """Sampling of bodies in a light's sheet that the camera sees, without those behind, inside or shadowed by objects.
 
-    ``travel`` is the motion of the sensor through the water during the exposure; None: at rest in it. ``per_litre`` is
-    the number of bodies larger than 0.1 mm, ``extinction`` that of the medium in 1/mm. With ``sparkle``, speckle varies
-    the light of each spot, with as many independent grains as its disc holds (gamma distribution: Goodman, Speckle
-    Phenomena, Sec. 4.6).
+    With speckle, the light of each spot varies, with as many independent grains as its disc holds (gamma distribution:
+    Goodman, Speckle Phenomena, Sec. 4.6).
     """
-    camera = view.camera
-    width, height = camera.width_px + 2 * _MARGIN_PX, camera.height_px + 2 * _MARGIN_PX
 
-    def seen(x: np.ndarray, y: np.ndarray, aside: np.ndarray) -> dict[str, np.ndarray]:
+    view: CameraView
+    objects: Objects
+    extinction: Float  # of the medium, 1/mm
+    wavelength_nm: float
+    effects: Effects
+
+    def sample(
+        self,
+        light: Light,
+        pose: SensorPose,
+        body: Body,
+        *,
+        travel: Travel | None,
+        per_litre: float,
+        rng: np.random.Generator,
+    ) -> Spots:
+        """Sample the visible bodies of one kind, with ``per_litre`` bodies larger than 0.1 mm.
+
+        ``travel`` is the motion of the sensor through the water during the exposure; None: at rest in it.
+        """
+        camera = self.view.camera
+        width, height = camera.width_px + 2 * _MARGIN_PX, camera.height_px + 2 * _MARGIN_PX
+        # The largest volume per pixel, found on a coarse grid, bounds the number of candidates.
+        x, y = (g.ravel() for g in np.meshgrid(np.linspace(0, 1, 24) * width, np.linspace(0, 1, 24) * height))
+        coarse = self._measure(x - _MARGIN_PX, y - _MARGIN_PX, np.zeros_like(x), light, pose, travel)["volume"]
+        if not coarse.any():
+            return Spots(*(np.zeros(0) for _ in range(4)))
+        largest = 1.5 * coarse.max()
+        tried = min(rng.poisson(1e-6 * per_litre * largest * width * height), _MOST_BODIES)
+        # At least two: empty arrays would compile separate kernels.
+        x, y = (rng.uniform(-_MARGIN_PX, side - _MARGIN_PX, max(tried, 2)) for side in (width, height))
+        aside = rng.uniform(-_SIGMAS, _SIGMAS, len(x))
+        found = self._measure(x, y, aside, light, pose, travel)
+        kept = (rng.uniform(0, largest, len(x)) < found["volume"]) & (np.arange(len(x)) < tried)
+        x, y, aside, found = x[kept], y[kept], aside[kept], {name: values[kept] for name, values in found.items()}
+        below = 1 - (_LEAST_MM / _MOST_MM) ** _SLOPE
+        diameter = _LEAST_MM * (1 - below * rng.random(len(x))) ** (-1 / _SLOPE)
+        match body:
+            case "particles":
+                share, shown = diffuse_sphere(found["cosine"]), diameter
+            case "bubbles":
+                # A glint, much smaller than the bubble.
+                share, shown = bubble(found["cosine"]), np.zeros_like(diameter)
+            case _:
+                assert_never(body)
+        intensity = share * np.square(diameter / 2)
+        blur = self.view.blur_radius_px(found["depth"]) if self.effects.defocus else 0.0
+        size_px = 0.5 * shown / np.sqrt(np.maximum(found["across"], 1e-12))
+        light_seen, radius = found["light"] * intensity / np.maximum(found["across"], 1e-12), np.hypot(size_px, blur)
+        if self.effects.speckle:
+            working = camera.f_number * (
+                1 + camera.focal_length_mm / (camera.focus_distance_mm - camera.focal_length_mm)
+            )
+            grain_px = 1e-3 * self.wavelength_nm * working / camera.pixel_size_um
+            grains = np.maximum(1.0, math.pi * np.square(radius / grain_px))
+            light_seen = light_seen * rng.gamma(grains) / grains
+        spots = Spots(x, y, light_seen, radius)
+        return spots if travel is None else _draw_out(spots, aside, found)
+
+    def _measure(
+        self, x: np.ndarray, y: np.ndarray, aside: np.ndarray, light: Light, pose: SensorPose, travel: Travel | None
+    ) -> dict[str, np.ndarray]:
         """Return volume (mm3) per pixel, light of the sheet, and area per pixel at image positions ``x`` and ``y``."""
         at = [(to_jit(x + dx), to_jit(y + dy)) for dx, dy in ((0, 0), (1, 0), (0, 1))]
-        bundles = [view.trace_bundle(*each) for each in at]
+        bundles = [self.view.trace_bundle(*each) for each in at]
         crossed = [light.intersect(*light.to_sheet_frame(each.origin, each.direction)) for each in bundles]
         t, bundle = crossed[0][0], bundles[0]
         points = [each.origin + each.direction * where for each, (where, _) in zip(bundles, crossed, strict=True)]
@@ -118,52 +163,17 @@ def sample_spots(
         place = mi.Point3f(points[0] + middle.normal * (reach * to_jit(aside)))
         lit = light.evaluate(place)
         brightness = lit.irradiance if travel is None else lit.in_middle
-        hit = objects.scene.ray_intersect_preliminary(pose.ray(bundle.origin, bundle.direction))
+        hit = self.objects.scene.ray_intersect_preliminary(pose.ray(bundle.origin, bundle.direction))
         free = (bundle.weight > 0) & (t > 0) & (~hit.is_valid() | (t < hit.t)) & (brightness > 0)
-        free &= light.reaches(objects.scene, place, lit, None, free)
+        free &= light.reaches(self.objects.scene, place, lit, None, free)
         volume = dr.select(free, area * 2 * _SIGMAS * reach, 0.0)
         across = area * dr.abs(dr.dot(bundle.direction, middle.normal))
         cosine = dr.dot(lit.direction, -bundle.direction)
-        gathered = bundle.weight * brightness * dr.exp(-extinction * t)
-        depth = view.depth_mm(mi.Point3f(points[0]))
+        gathered = bundle.weight * brightness * dr.exp(-self.extinction * t)
+        depth = self.view.depth_mm(mi.Point3f(points[0]))
         values = {"volume": volume, "light": gathered, "across": across, "cosine": cosine, "depth": depth} | tracks
         dr.eval(*values.values())
         return {name: value.numpy().astype(float) for name, value in values.items()}
-
-    # The largest volume per pixel, found on a coarse grid, bounds the number of candidates.
-    x, y = (g.ravel() for g in np.meshgrid(np.linspace(0, 1, 24) * width, np.linspace(0, 1, 24) * height))
-    coarse = seen(x - _MARGIN_PX, y - _MARGIN_PX, np.zeros_like(x))["volume"]
-    if not coarse.any():
-        return Spots(*(np.zeros(0) for _ in range(4)))
-    largest = 1.5 * coarse.max()
-    tried = min(rng.poisson(1e-6 * per_litre * largest * width * height), _MOST_BODIES)
-    # At least two: empty arrays would compile separate kernels.
-    x, y = (rng.uniform(-_MARGIN_PX, side - _MARGIN_PX, max(tried, 2)) for side in (width, height))
-    aside = rng.uniform(-_SIGMAS, _SIGMAS, len(x))
-    found = seen(x, y, aside)
-    kept = (rng.uniform(0, largest, len(x)) < found["volume"]) & (np.arange(len(x)) < tried)
-    x, y, aside, found = x[kept], y[kept], aside[kept], {name: values[kept] for name, values in found.items()}
-    below = 1 - (_LEAST_MM / _MOST_MM) ** _SLOPE
-    diameter = _LEAST_MM * (1 - below * rng.random(len(x))) ** (-1 / _SLOPE)
-    match body:
-        case "particles":
-            share, shown = diffuse_sphere(found["cosine"]), diameter
-        case "bubbles":
-            # A glint, much smaller than the bubble.
-            share, shown = bubble(found["cosine"]), np.zeros_like(diameter)
-        case _:
-            assert_never(body)
-    intensity = share * np.square(diameter / 2)
-    blur = view.blur_radius_px(found["depth"]) if defocus else 0.0
-    size_px = 0.5 * shown / np.sqrt(np.maximum(found["across"], 1e-12))
-    light_seen, radius = found["light"] * intensity / np.maximum(found["across"], 1e-12), np.hypot(size_px, blur)
-    if sparkle:
-        working = camera.f_number * (1 + camera.focal_length_mm / (camera.focus_distance_mm - camera.focal_length_mm))
-        grain_px = 1e-3 * wavelength_nm * working / camera.pixel_size_um
-        grains = np.maximum(1.0, math.pi * np.square(radius / grain_px))
-        light_seen = light_seen * rng.gamma(grains) / grains
-    spots = Spots(x, y, light_seen, radius)
-    return spots if travel is None else _draw_out(spots, aside, found)
 
 
 def _image_shift(way: Vector3f, right: Vector3f, down: Vector3f, ray: Vector3f) -> tuple[Float, Float]:
@@ -190,8 +200,8 @@ def _draw_out(spots: Spots, aside: np.ndarray, found: dict[str, np.ndarray]) -> 
     step = np.arange(len(body)) - np.repeat(np.cumsum(steps) - steps, steps)
     duration = (last - first)[body] / steps[body]
     t = first[body] + duration * (step + 0.5)
-    away = (aside * found["reach"])[body] + through[body] * t
-    share = duration * np.exp(-0.5 * np.square(away / sigma[body]))
+    distance = (aside * found["reach"])[body] + through[body] * t
+    share = duration * np.exp(-0.5 * np.square(distance / sigma[body]))
     x, y = (
         getattr(spots, axis)[body] + found[f"start_{axis}"][body] + found[f"moved_{axis}"][body] * t for axis in "xy"
     )

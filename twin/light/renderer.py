@@ -12,8 +12,8 @@ fixed in the scene, so nothing is rebuilt or recompiled between frames.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Literal
 
@@ -22,12 +22,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.backend.arrays import Float, Point3f, UInt32, Vector4f, begin_kernels, opaque, to_jit
+from twin.backend.arrays import Float, UInt32, Vector4f, begin_kernels, opaque, to_jit
 from twin.light.camera import CameraView, RaySegment, trace_segments
 from twin.light.illumination import (
-    CELLS,
-    PATCH_MM,
     Caustics,
+    EvenLight,
     Light,
     SheetCrossing,
     compute_haze,
@@ -36,27 +35,26 @@ from twin.light.illumination import (
 )
 from twin.light.image_sampling import (
     NODE_SPACING_PX,
+    PixelSampler,
     combine_corners,
     dilate_cells,
     expand_cells,
     find_marked,
-    make_lattice,
     mark_near_sheet,
-    pupil_shifts,
+    split_pixels,
 )
 from twin.light.multiple_scattering import IndirectLight, decay_with_distance
-from twin.light.particles import Body, sample_spots
+from twin.light.particles import Body, SpotSampler
 from twin.light.pose import Rays, SensorPose, Travel
 from twin.light.sheet import Sheet, SheetLight, lit_sigma_mm, spread_irradiance
 from twin.light.walk import Walker
 from twin.light.water import Scattering
 from twin.rendering_options import ALL, Effects, Flaws
 from twin.scene.description import Scene
-from twin.scene.objects import build_objects
+from twin.scene.objects import MirrorFace, Objects, build_objects
 from uwlts.model.placement import camera_from_object, check_design
 from uwlts.model.sensor import Medium, Sensor
 
-SAMPLES_AT_ONCE = 2**23  # largest number of samples rendered together; this many take about 100 MB
 CHANGE_SHARE = 2e-3
 """In lamp images, pixels are sampled finely if their corners differ by more than this fraction of the maximum."""
 BEND_SHARE = 1e-3
@@ -66,7 +64,6 @@ _LEAST_SPP = 4  # smallest number of samples there: one for each quarter of the 
 _WIDE_PX = 64  # mean width of a stripe in px below which all pixels are sampled finely: most would need it
 _MIRRORS = 2  # largest number of successive mirror reflections of a camera ray
 _WALKS_PER_SAMPLE = 0.15  # random walks per cell and sample of a lit pixel in clear water; turbid water takes more
-_SPOT_ASIDE = 0.25  # offset of an uneven lamp's axis from the camera's axis, as a fraction of the view's corner slope
 _DRIFTING_STREAM = 7  # random number stream of particles and bubbles, separate from those of walks and noise
 _TRAVEL_STEP_MM = 0.2  # while the sensor moves, lit pixels are located at positions of this spacing
 _STRIPE_SUMS, _LINE_SUMS = 3, 3
@@ -79,7 +76,7 @@ class _LocatedStripes:
     """Stripes of a pose in cells of the nodes' grid, and what else is known of that pose."""
 
     pose: SensorPose
-    own: np.ndarray  # mask of the cells that the first laser's stripe meets
+    first: np.ndarray  # mask of the cells that the first laser's stripe meets
     lit: np.ndarray  # mask of the cells that light of any stripe reaches
     nodes: tuple[np.ndarray, list[np.ndarray]] | None
     """Haze (H, W) in W/mm2 and images of lit surfaces (`IndirectLight.image`).
@@ -88,6 +85,209 @@ class _LocatedStripes:
     """
     line_light: tuple[np.ndarray, int, tuple[np.ndarray, ...]] | None = None
     """Lines, number of samples, and result of `Renderer.render_line_light`, if the laser's frame measured it."""
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceLight:
+    """Light of laser sheets on surfaces, seen directly or after up to ``mirrors`` mirrors."""
+
+    objects: Objects
+    scattering: Scattering
+    mirrors: int
+
+    def segments(self, pose: SensorPose, bundle: Rays, after_s: Float | None) -> Iterator[RaySegment]:
+        """Return the segments of camera rays, those after mirrors too."""
+        return trace_segments(self.objects, self.scattering.c, pose, bundle, after_s, mirrors=self.mirrors)
+
+    def radiance(
+        self, pose: SensorPose, segment: RaySegment, sources: list[Light], after_s: Float | None, *, lobes: bool = True
+    ) -> Float:
+        """Return the radiance in W/mm2/sr of lit surfaces along segments, attenuated to the segments' start.
+
+        It is that of the main parts of the sheets alone without ``lobes``.
+        """
+        radiance, end, bsdf = mi.Float(0.0), segment.end(), segment.si.bsdf()
+        for light in sources:
+            here = light.evaluate(end, after_s)
+            across = light.sheet.parts if lobes else light.sheet.parts[:1]
+            arriving = here.irradiance
+            if not lobes:
+                arriving = across[0][0] * (here.in_middle * dr.exp(-0.5 * dr.square(here.distance_mm / here.sigma_mm)))
+            # The light of a coat or metal leaves where it arrives, that of a body is spread.
+            parts = [(mi.BSDFContext(), arriving)]
+            if self.objects.translucent:
+                body, coat = mi.BSDFContext(), mi.BSDFContext()
+                body.type_mask, coat.type_mask = mi.BSDFFlags.DiffuseReflection, mi.BSDFFlags.GlossyReflection
+                normal = pose.object_direction(segment.si.n, after_s)
+                spread = spread_irradiance(self.objects, segment.si, normal, here, across)
+                parts = [(coat, arriving), (body, spread)]
+            bright = segment.valid & (sum((value for _, value in parts), mi.Float(0.0)) > 0)
+            lit = light.reaches(self.objects.scene, end, here, after_s, bright)
+            towards = segment.si.to_local(pose.direction(-here.direction, after_s))
+            for context, value in parts:
+                radiance += dr.select(lit, bsdf.eval(context, segment.si, towards, lit)[0] * value, 0.0)
+        return radiance * dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, 0.0))
+
+    def lit_near_sheets(self, pose: SensorPose, segment: RaySegment, ends: list[SheetLight]) -> list[Float]:
+        """Return irradiance per ray of surfaces near the sheets for `IndirectLight`; ``ends`` is the light there."""
+        bsdf = segment.si.bsdf()
+        seen = segment.weight * dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, 0.0))
+        parts = []
+        for here in ends:
+            active = segment.valid & (here.in_middle > 0)
+            towards = segment.si.to_local(pose.direction(-here.direction))
+            sent = bsdf.eval(mi.BSDFContext(), segment.si, towards, active)[0]
+            sent *= seen * here.in_middle * here.sigma_mm
+            parts.append(decay_with_distance(sent, here.distance_mm, active))
+        return [sum(each, mi.Float(0.0)) for each in zip(*parts, strict=True)]
+
+    def sums(
+        self,
+        pose: SensorPose,
+        bundle: Rays,
+        after_s: Float | None,
+        pixel: UInt32,
+        sources: list[Light],
+        planes: Float | None,
+    ) -> tuple[Float, ...]:
+        """Return irradiance per ray of surfaces seen directly or in mirrors, plain and weighted for speckle.
+
+        The weights are polarisation and roughness of the surfaces. With ``planes`` of the pixels' lines, samples of
+        `render_line_light` follow.
+        """
+        total, polarised, rough = mi.Float(0.0), mi.Float(0.0), mi.Float(0.0)
+        of_line: tuple[Float, ...] = ()
+        for index, segment in enumerate(self.segments(pose, bundle, after_s)):
+            value = segment.weight * self.radiance(pose, segment, sources, after_s)
+            total += value
+            polarised += value * self.objects.polarisation(segment.si)
+            rough += value * self.objects.roughness_um(segment.si)
+            if planes is not None and index == 0:
+                of_line = self._line_sums(pose, segment, after_s, sources, value, dr.gather(mi.Vector4f, planes, pixel))
+        return total, polarised, rough, *of_line
+
+    def _line_sums(
+        self,
+        pose: SensorPose,
+        segment: RaySegment,
+        after_s: Float | None,
+        sources: list[Light],
+        value: Float,
+        plane: Vector4f,
+    ) -> tuple[Float, Float, Float]:
+        """Return samples for `render_line_light`; ``value`` is the light of all ``sources`` on the segments' ends."""
+        light = sources[0]
+        if len(sources) > 1 or len(light.sheet.parts) > 1:
+            value = segment.weight * self.radiance(pose, segment, [light], after_s, lobes=False)
+        here = light.evaluate(segment.end(), after_s)
+        height = dr.dot(mi.Vector3f(plane.x, plane.y, plane.z), mi.Vector3f(segment.si.p)) - plane.w
+        same = dr.abs(height) <= here.sigma_mm
+        profile = dr.exp(-0.5 * dr.square(here.distance_mm / here.sigma_mm))
+        profile /= here.sigma_mm * math.sqrt(2 * math.pi)
+        return value, dr.select(same, 0.0, value), dr.select(same & (value > 0), profile, 0.0)
+
+    def distances(self, here: SheetLight, segment: RaySegment, pose: SensorPose, reach: float) -> Float:
+        """Return distances of segment ends from a sheet in ``reach`` standard deviations; infinite off surfaces."""
+        sigma = here.sigma_mm
+        if self.objects.translucent:
+            sigma = lit_sigma_mm(self.objects, segment.si, pose.object_direction(segment.si.n), here)
+        if reach != 1:
+            sigma = sigma * opaque(reach)
+        return dr.select(segment.valid, here.distance_mm / sigma, dr.inf)
+
+
+@dataclass(eq=False)
+class StripeLocator:
+    """Search for the pixels of stripes by the rays of a coarse grid, which also give haze and lit surfaces."""
+
+    surfaces: SurfaceLight
+    pixels: PixelSampler
+    sheets: list[Sheet]
+    mirrors: Sequence[MirrorFace]
+    effects: Effects
+    reach_mm: float
+    _crossings: dict[Sheet, SheetCrossing] = field(default_factory=dict)
+    _last: _LocatedStripes | None = None
+
+    @property
+    def _size(self) -> tuple[int, int]:
+        return self.pixels.view.camera.height_px, self.pixels.view.camera.width_px
+
+    def locate(self, pose: SensorPose, *, with_nodes: bool = False) -> _LocatedStripes:
+        """Locate the stripes; they are known for the last pose, unless its nodes are wanted again."""
+        last = self._last
+        if last is None or not pose.equals(last.pose) or (with_nodes and last.nodes is None):
+            begin_kernels()
+            lights = make_lights(self.sheets, pose, self.mirrors)
+            last = self._last = _LocatedStripes(pose, *self._laser_nodes(pose, *lights))
+        return last
+
+    def lit_pixels(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray]:
+        """Return rows and columns of the pixels whose chief rays meet the stripe of the first laser."""
+        return find_marked(expand_cells(self.locate(pose).first, *self._size))
+
+    def _laser_nodes(
+        self, pose: SensorPose, direct: list[Light], mirrored: list[Light]
+    ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, list[np.ndarray]]]:
+        """Return the cells (rows, columns) of the first laser's stripe and of all stripes, haze and lit surfaces."""
+        bundle, shape = self.pixels.view.trace_grid(NODE_SPACING_PX)
+        lit = np.zeros((shape[0] - 1, shape[1] - 1), bool)
+        first_lit, reach = lit.copy(), np.zeros_like(lit, np.float32)
+        image = np.zeros(self._size, np.float32)
+        surfaces: list[Float] = []
+        scatters = self.surfaces.scattering.coefficient > 0 and (self.effects.haze or self.effects.multiple_scattering)
+        for moment, sources in self._moments(pose, direct + mirrored):
+            scattered = mi.Float(0.0)
+            for index, segment in enumerate(self.surfaces.segments(moment, bundle, None)):
+                ends = [light.evaluate(segment.end()) for light in sources]
+                across = [
+                    self.surfaces.distances(here, segment, moment, light.sheet.reach)
+                    for light, here in zip(sources, ends, strict=True)
+                ]
+                straight = mi.Point3f(bundle.origin + bundle.direction * (segment.length_before + segment.si.t))
+                depth = dr.select(segment.valid, self.pixels.view.depth_mm(straight), dr.nan)
+                if index == 0 and moment is pose and scatters:
+                    if self.effects.multiple_scattering:
+                        surfaces = self.surfaces.lit_near_sheets(pose, segment, ends)
+                    for light, here in zip(sources, ends, strict=True):
+                        crossed = self._crossing(light, bundle)
+                        scattered += compute_haze(crossed, light, self.surfaces.objects.scene, segment, here)
+                reached = [light.may_reach(segment.end(), here) for light, here in zip(sources, ends, strict=True)]
+                dr.eval(depth, scattered, surfaces, *across, *reached)
+                lit_there = (True if there is None else there.numpy().reshape(shape) for there in reached)
+                sigmas = [each.numpy().reshape(shape) for each in across]
+                stripes = [mark_near_sheet(*each) for each in zip(sigmas, lit_there, strict=True)]
+                near = np.any(stripes, axis=0)
+                if index == 0:
+                    first_lit |= stripes[0]
+                if self.pixels.defocus:
+                    reach = np.fmax(reach, self.pixels.blur_px(near, depth.numpy().reshape(shape)))
+                lit |= near
+            if moment is pose and dr.width(scattered) > 1:
+                image = expand_cells(0.25 * combine_corners(np.add, scattered.numpy().reshape(shape)), *self._size)
+        return first_lit, dilate_cells(lit, reach), (image, [each.numpy().reshape(shape) for each in surfaces])
+
+    def _moments(self, pose: SensorPose, sources: list[Light]) -> Iterator[tuple[SensorPose, list[Light]]]:
+        """Yield the pose and its lights, and further poses during the exposure if the sensor moves."""
+        yield pose, sources
+        if pose.travel is not None:
+            first, last = pose.travel.time_range(self._size[0])
+            fastest = np.linalg.norm(pose.travel.velocity_mm_s) + np.linalg.norm(pose.travel.turn_rad_s) * self.reach_mm
+            way_mm = float((last - first) * fastest)
+            for after_s in np.linspace(first, last, 2 + int(way_mm / _TRAVEL_STEP_MM)):
+                moved = pose.displace(float(after_s))
+                direct, mirrored = make_lights(self.sheets, moved, self.mirrors)
+                yield moved, direct + mirrored
+
+    def _crossing(self, light: Light, bundle: Rays) -> SheetCrossing:
+        """Return the intersections of the nodes' rays with a sheet, cached for direct lights."""
+        if light.mirror is not None:
+            return intersect_sheet(light, self.surfaces.scattering, bundle)
+        if light.sheet not in self._crossings:
+            found = intersect_sheet(light, self.surfaces.scattering, bundle)
+            dr.eval(vars(found))
+            self._crossings[light.sheet] = found
+        return self._crossings[light.sheet]
 
 
 @dataclass(frozen=True)
@@ -147,34 +347,30 @@ class Renderer:
         self.design = check_design(sensor, medium)
         self.sensor, self.medium, self.effects, self._flaws = sensor, medium, effects, flaws
         self._size, wavelength = (sensor.camera.height_px, sensor.camera.width_px), sensor.laser.wavelength_nm
+        index = medium.refractive_index(wavelength)
         self.objects = build_objects(
-            scene,
-            medium_index=medium.refractive_index(wavelength),
-            wavelength_nm=wavelength,
-            gloss=effects.gloss,
-            seed=seed,
+            scene, medium_index=index, wavelength_nm=wavelength, gloss=effects.gloss, seed=seed
         )
         self.view = CameraView(sensor, medium)
         self.scattering = Scattering(medium, wavelength)
         self._caustics = None
         if flaws.caustics and medium.kind != "air":
-            self._caustics = Caustics(
-                wind_m_s=flaws.caustics,
-                depth_mm=1e3 * scene.depth_m,
-                index=medium.refractive_index(wavelength),
-                scattering_per_mm=self.scattering.coefficient,
-                seed=seed,
-            )
+            water = {"depth_mm": 1e3 * scene.depth_m, "scattering_per_mm": self.scattering.coefficient}
+            self._caustics = Caustics(wind_m_s=flaws.caustics, index=index, **water, seed=seed)
         self.sheet = Sheet(sensor, medium)
         self._sheets = [self.sheet, *(Sheet(sensor, medium, laser) for laser in sensor.more_lasers)]
-        self._crossings: dict[Sheet, SheetCrossing] = {}
         self._mirrors = self.objects.mirrors if effects.secondary_light else ()
+        self._surfaces = SurfaceLight(self.objects, self.scattering, _MIRRORS if self._mirrors else 0)
+        self._pixels = PixelSampler(self.view, effects.defocus)
+        standoff_mm, reach_mm = self.design.standoff_mm, _REACH_SHARE * self.design.standoff_mm
+        self._even = EvenLight(
+            sensor, self.view, self.objects, self.scattering, standoff_mm, effects.haze, flaws.uneven_lamp
+        )
+        self.locator = StripeLocator(self._surfaces, self._pixels, self._sheets, self._mirrors, effects, reach_mm)
         # Mean number of scattering events from the sensor to the stand-off and back.
         scatterings = 2 * self.scattering.coefficient * self.design.standoff_mm
         self._walks_per_sample = _WALKS_PER_SAMPLE * (1 + 4 * scatterings * (1 + scatterings))
-        self._scatters = self.scattering.coefficient > 0 and (effects.haze or effects.multiple_scattering)
         self._reach_mm = opaque(4 * float(np.linalg.norm(camera_from_object(sensor)[:3, 3])))
-        self._last: _LocatedStripes | None = None
 
     def irradiance(
         self,
@@ -199,8 +395,8 @@ class Renderer:
             pattern = to_jit(self._caustics.pattern(time_s, exposure_s))
         begin_kernels()
         bundle, shape = self.view.trace_grid(1)
-        segment = next(self._segments(pose, bundle, None))
-        value = self._compute_even_light(segment, ambient, pattern)
+        segment = next(self._surfaces.segments(pose, bundle, None))
+        value = self._even.irradiance(segment, ambient, pattern)
         depth = dr.select(segment.valid, self.view.depth_mm(segment.end()), dr.nan)
         dr.eval(value, depth)
         nodes = value.numpy().reshape(shape)
@@ -208,16 +404,16 @@ class Renderer:
         low, high = combine_corners(np.minimum, nodes), combine_corners(np.maximum, nodes)
         changes = high - low > CHANGE_SHARE * nodes.max()
         if self.effects.defocus:
-            changes = dilate_cells(changes, self._blur_px(changes, depth.numpy().reshape(shape)), cell_px=1)
+            changes = dilate_cells(changes, self._pixels.blur_px(changes, depth.numpy().reshape(shape)), cell_px=1)
         if travel is not None:
             changes[:] = True  # motion may change any pixel
         image = 0.25 * combine_corners(np.add, nodes)
 
         def evenly_lit(pose: SensorPose, bundle: Rays, after_s: Float | None, pixel: UInt32) -> tuple[Float]:
-            return (self._compute_even_light(next(self._segments(pose, bundle, after_s)), ambient, pattern),)
+            return (self._even.irradiance(next(self._surfaces.segments(pose, bundle, after_s)), ambient, pattern),)
 
-        for rows, columns in _split_pixels(*find_marked(changes), spp=spp):
-            image[rows, columns] = self._render_pixels(evenly_lit, pose, rows, columns, spp=spp, shifted=True)()[0]
+        for rows, columns in split_pixels(*find_marked(changes), spp=spp):
+            image[rows, columns] = self._pixels.render(evenly_lit, pose, rows, columns, spp=spp, shifted=True)()[0]
         return image
 
     def laser_frame(
@@ -237,7 +433,7 @@ class Renderer:
         in the same pass and needs no time later.
         """
         pose = SensorPose(scene_from_object, travel)
-        located = self._locate_stripes(pose, with_nodes=True)
+        located = self.locator.locate(pose, with_nodes=True)
         assert located.nodes is not None
         lit, (haze, surfaces), located.nodes = located.lit, located.nodes, None
         begin_kernels()
@@ -267,46 +463,21 @@ class Renderer:
     ) -> np.ndarray:
         """Return the irradiance (H, W) in W/mm2 of particles and bubbles in the sheets."""
         image = np.zeros(self._size, np.float32)
-        rng = np.random.default_rng([seed, _DRIFTING_STREAM])
+        wavelength, rng = self.sensor.laser.wavelength_nm, np.random.default_rng([seed, _DRIFTING_STREAM])
+        sampler = SpotSampler(self.view, self.objects, self.scattering.c, wavelength, self.effects)
         bodies: tuple[tuple[Body, float], ...]
         bodies = ("particles", self._flaws.particles), ("bubbles", self._flaws.bubbles)
         for body, per_litre in bodies:
             for light in direct if per_litre > 0 else ():
-                seen = sample_spots(
-                    self.view,
-                    light,
-                    self.objects,
-                    pose,
-                    travel=through_water,
-                    body=body,
-                    per_litre=per_litre,
-                    extinction=self.scattering.c,
-                    wavelength_nm=self.sensor.laser.wavelength_nm,
-                    defocus=self.effects.defocus,
-                    sparkle=self.effects.speckle,
-                    rng=rng,
-                )
+                seen = sampler.sample(light, pose, body, travel=through_water, per_litre=per_litre, rng=rng)
                 image += seen.draw(*self._size)
         return image
-
-    def lit_pixels(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray]:
-        """Return rows and columns of the pixels whose chief rays meet the stripe of the first laser."""
-        return find_marked(expand_cells(self._locate_stripes(pose).own, *self._size))
-
-    def _locate_stripes(self, pose: SensorPose, *, with_nodes: bool = False) -> _LocatedStripes:
-        """Locate the stripes; they are known for the last pose, unless its nodes are wanted again."""
-        last = self._last
-        if last is None or not pose.equals(last.pose) or (with_nodes and last.nodes is None):
-            begin_kernels()
-            lights = make_lights(self._sheets, pose, self._mirrors)
-            last = self._last = _LocatedStripes(pose, *self._laser_nodes(pose, *lights))
-        return last
 
     def laser(self, pose: SensorPose, bundle: Rays, after_s: Float | None = None) -> tuple[Float, RaySegment]:
         """Return the irradiance in W/mm2 per ray of the first laser on directly visible surfaces, and the rays."""
         direct, _ = make_lights(self._sheets[:1], pose)
-        segment = next(self._segments(pose, bundle, after_s))
-        return segment.weight * self._radiance(pose, segment, direct, after_s), segment
+        segment = next(self._surfaces.segments(pose, bundle, after_s))
+        return segment.weight * self._surfaces.radiance(pose, segment, direct, after_s), segment
 
     def render_line_light(self, pose: SensorPose, lines: np.ndarray, *, spp: int) -> tuple[np.ndarray, ...]:
         """Return the first laser's light on directly visible surfaces, and how much of it is on the lines' surfaces.
@@ -319,7 +490,7 @@ class Renderer:
         normal there. Side lobes of the sheet are excluded. A line's surface is what lies within one standard deviation
         of the sheet of the plane through its point. It is known if the last frame was rendered with the same arguments.
         """
-        located = self._locate_stripes(pose)
+        located = self.locator.locate(pose)
         if located.line_light is not None:
             known_lines, known_spp, light = located.line_light
             if known_spp == spp and np.array_equal(known_lines, lines, equal_nan=True):
@@ -338,170 +509,6 @@ class Renderer:
     def _line_numbers(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         return columns if self.sensor.camera.stripe_along == "width" else rows
 
-    # --- the lit surface ----------------------------------------------------------------------------------------------
-
-    def _segments(self, pose: SensorPose, bundle: Rays, after_s: Float | None) -> Iterator[RaySegment]:
-        mirrors = _MIRRORS if self._mirrors else 0
-        return trace_segments(self.objects, self.scattering.c, pose, bundle, after_s, mirrors=mirrors)
-
-    def _radiance(
-        self, pose: SensorPose, segment: RaySegment, sources: list[Light], after_s: Float | None, *, lobes: bool = True
-    ) -> Float:
-        """Return the radiance in W/mm2/sr of lit surfaces along segments, attenuated to the segments' start.
-
-        It is that of the main parts of the sheets alone without ``lobes``.
-        """
-        radiance, end, bsdf = mi.Float(0.0), segment.end(), segment.si.bsdf()
-        for light in sources:
-            here = light.evaluate(end, after_s)
-            across = light.sheet.parts if lobes else light.sheet.parts[:1]
-            arriving = here.irradiance
-            if not lobes:
-                arriving = across[0][0] * (here.in_middle * dr.exp(-0.5 * dr.square(here.distance_mm / here.sigma_mm)))
-            # The light of a coat or metal leaves where it arrives, that of a body is spread.
-            parts = [(mi.BSDFContext(), arriving)]
-            if self.objects.translucent:
-                body, coat = mi.BSDFContext(), mi.BSDFContext()
-                body.type_mask, coat.type_mask = mi.BSDFFlags.DiffuseReflection, mi.BSDFFlags.GlossyReflection
-                normal = pose.object_direction(segment.si.n, after_s)
-                spread = spread_irradiance(self.objects, segment.si, normal, here, across)
-                parts = [(coat, arriving), (body, spread)]
-            bright = segment.valid & (sum((value for _, value in parts), mi.Float(0.0)) > 0)
-            lit = light.reaches(self.objects.scene, end, here, after_s, bright)
-            towards = segment.si.to_local(pose.direction(-here.direction, after_s))
-            for context, value in parts:
-                radiance += dr.select(lit, bsdf.eval(context, segment.si, towards, lit)[0] * value, 0.0)
-        return radiance * dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, 0.0))
-
-    # --- nodes: where the stripe is, and the haze ---------------------------------------------------------------------
-
-    def _laser_nodes(
-        self, pose: SensorPose, direct: list[Light], mirrored: list[Light]
-    ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, list[np.ndarray]]]:
-        """Return the cells (rows, columns) of the first laser's stripe and of all stripes, haze and lit surfaces."""
-        bundle, shape = self.view.trace_grid(NODE_SPACING_PX)
-        lit = np.zeros((shape[0] - 1, shape[1] - 1), bool)
-        own, reach = lit.copy(), np.zeros_like(lit, np.float32)
-        image = np.zeros(self._size, np.float32)
-        surfaces: list[Float] = []
-        for moment, sources in self._moments(pose, direct + mirrored):
-            scattered = mi.Float(0.0)
-            for index, segment in enumerate(self._segments(moment, bundle, None)):
-                ends = [light.evaluate(segment.end()) for light in sources]
-                across = [
-                    self._sigmas(here, segment, moment, light.sheet.reach)
-                    for light, here in zip(sources, ends, strict=True)
-                ]
-                straight = mi.Point3f(bundle.origin + bundle.direction * (segment.length_before + segment.si.t))
-                depth = dr.select(segment.valid, self.view.depth_mm(straight), dr.nan)
-                if index == 0 and moment is pose and self._scatters:
-                    if self.effects.multiple_scattering:
-                        surfaces = self._surfaces(pose, segment, ends)
-                    for light, here in zip(sources, ends, strict=True):
-                        crossed = self._crossing(light, bundle)
-                        scattered += compute_haze(crossed, light, self.objects.scene, segment, here)
-                reached = [light.may_reach(segment.end(), here) for light, here in zip(sources, ends, strict=True)]
-                dr.eval(depth, scattered, surfaces, *across, *reached)
-                stripes = [
-                    mark_near_sheet(
-                        sigmas.numpy().reshape(shape), True if there is None else there.numpy().reshape(shape)
-                    )
-                    for sigmas, there in zip(across, reached, strict=True)
-                ]
-                near = np.any(stripes, axis=0)
-                if index == 0:
-                    own |= stripes[0]
-                if self.effects.defocus:
-                    reach = np.fmax(reach, self._blur_px(near, depth.numpy().reshape(shape)))
-                lit |= near
-            if moment is pose and dr.width(scattered) > 1:
-                image = expand_cells(0.25 * combine_corners(np.add, scattered.numpy().reshape(shape)), *self._size)
-        return own, dilate_cells(lit, reach), (image, [each.numpy().reshape(shape) for each in surfaces])
-
-    def _moments(self, pose: SensorPose, sources: list[Light]) -> Iterator[tuple[SensorPose, list[Light]]]:
-        """Yield the pose and its lights, and further poses during the exposure if the sensor moves."""
-        yield pose, sources
-        if pose.travel is not None:
-            first, last = pose.travel.time_range(self.sensor.camera.height_px)
-            way_mm = (last - first) * pose.travel.fastest_mm_s(_REACH_SHARE * self.design.standoff_mm)
-            for after_s in np.linspace(first, last, 2 + int(way_mm / _TRAVEL_STEP_MM)):
-                moved = pose.displace(float(after_s))
-                direct, mirrored = make_lights(self._sheets, moved, self._mirrors)
-                yield moved, direct + mirrored
-
-    def _crossing(self, light: Light, bundle: Rays) -> SheetCrossing:
-        """Return the intersections of the nodes' rays with a sheet, cached for direct lights."""
-        if light.mirror is not None:
-            return intersect_sheet(light, self.scattering, bundle)
-        if light.sheet not in self._crossings:
-            found = intersect_sheet(light, self.scattering, bundle)
-            dr.eval(vars(found))
-            self._crossings[light.sheet] = found
-        return self._crossings[light.sheet]
-
-    def _surfaces(self, pose: SensorPose, segment: RaySegment, ends: list[SheetLight]) -> list[Float]:
-        """Return irradiance per ray of surfaces near the sheets for `IndirectLight`; ``ends`` is the light there."""
-        bsdf = segment.si.bsdf()
-        seen = segment.weight * dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, 0.0))
-        parts = []
-        for here in ends:
-            active = segment.valid & (here.in_middle > 0)
-            towards = segment.si.to_local(pose.direction(-here.direction))
-            sent = bsdf.eval(mi.BSDFContext(), segment.si, towards, active)[0]
-            sent *= seen * here.in_middle * here.sigma_mm
-            parts.append(decay_with_distance(sent, here.distance_mm, active))
-        return [sum(each, mi.Float(0.0)) for each in zip(*parts, strict=True)]
-
-    # --- lamp ---------------------------------------------------------------------------------------------------------
-
-    def _compute_even_light(self, segment: RaySegment, ambient: bool, pattern: Float | None) -> Float:
-        """Return the irradiance per ray in W/mm2 for evenly lit surfaces, seen through the water and its veiling light.
-
-        A surface of albedo A at the irradiance E has the radiance A E / pi. Daylight is isotropic, so the water
-        scatters the radiance E / pi into every ray. The lamp is beside the camera, so only backscattered light returns.
-        Up to the distance t, the veiling light is E / pi (1 - exp(-c t)) times the scattered fraction of the extinction
-        c (Duntley 1963, Eq. 4, for an even light field). ``pattern`` is that of focused daylight on surfaces.
-        """
-        lamp = self.sensor.lamp
-        level = opaque(1e-6 / math.pi * (lamp.ambient_w_per_m2 if ambient else lamp.irradiance_w_per_m2))
-        left = dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, dr.inf))
-        albedo = self.objects.albedo(segment.si) if ambient else self.objects.lamp_albedo(segment.si)
-        radiance = dr.select(segment.valid, albedo * left, 0.0)
-        if pattern is not None:
-            radiance *= self._caustic(segment.si.p, pattern)
-        if self.effects.haze and self.scattering.coefficient > 0:
-            scattered = self.scattering.coefficient * (1 if ambient else self.scattering.backward_share)
-            radiance += opaque(scattered / self.scattering.extinction) * (1 - left)
-        if self._flaws.uneven_lamp and not ambient:
-            radiance *= self._lamp_share(segment)
-        return segment.weight * level * radiance
-
-    def _caustic(self, p: Point3f, pattern: Float) -> Float:
-        """Return the relative daylight at points of the scene: the pattern at X and Y, interpolated linearly."""
-        x, y = p.x * (CELLS / PATCH_MM), p.y * (CELLS / PATCH_MM)
-        left, top = dr.floor(x), dr.floor(y)
-
-        def read(beside: int, below: int) -> Float:
-            column, row = mi.Int32(left) + beside, mi.Int32(top) + below
-            # The number of cells is a power of two, so that the bits below it count periodically.
-            return dr.gather(mi.Float, pattern, mi.UInt32((row & (CELLS - 1)) * CELLS + (column & (CELLS - 1))))
-
-        above, below = (dr.lerp(read(0, row), read(1, row), x - left) for row in (0, 1))
-        return dr.lerp(above, below, y - top)
-
-    def _lamp_share(self, segment: RaySegment) -> Float:
-        """Return the fraction of lamp light at the end of camera rays: a round Gaussian spot about the lamp's axis.
-
-        The fraction `Flaws.uneven_lamp` is lost at the corner slope's distance from that axis.
-        """
-        length = dr.select(segment.valid, segment.si.t, self.design.standoff_mm)
-        x, y = self.view.slopes(mi.Point3f(segment.origin + segment.direction * length))
-        corner = self.sensor.camera.corner_slope()
-        squared = dr.square(x / corner - _SPOT_ASIDE) + dr.square(y / corner)
-        return dr.exp(math.log(1 - self._flaws.uneven_lamp) * squared)
-
-    # --- pixels -------------------------------------------------------------------------------------------------------
-
     def _render_stripe(
         self,
         pose: SensorPose,
@@ -512,7 +519,7 @@ class Renderer:
         spp: int,
         lines: np.ndarray | None = None,
     ) -> Callable[[], np.ndarray]:
-        """Render the stripe; return a function that fetches the means (K, P) of `_stripe_sums` over pixels.
+        """Render the stripe; return a function that fetches the means (K, P) of `SurfaceLight.sums` over pixels.
 
         Rendering is asynchronous. In a wide stripe, pixels with smooth light take few samples, unless the light of
         ``lines`` needs all.
@@ -525,11 +532,11 @@ class Renderer:
 
         def start(where: np.ndarray, spp: int) -> Callable[[], np.ndarray]:
             found: list[Callable[[], np.ndarray]] = []
-            for part in _split_pixels(rows[where], columns[where], spp=spp):
+            for part in split_pixels(rows[where], columns[where], spp=spp):
                 if found:
                     dr.sync_thread()  # limits memory to the samples of one part
                 of_pixels = None if planes is None else to_jit(planes[self._line_numbers(*part)])
-                found.append(self._render_pixels(self._stripe_sums, pose, *part, sources, of_pixels, spp=spp))
+                found.append(self._pixels.render(self._surfaces.sums, pose, *part, sources, of_pixels, spp=spp))
             return lambda: np.concatenate([np.zeros((count, 0), np.float32), *(means() for means in found)], axis=1)
 
         everywhere, all_lines = np.arange(len(rows)), self.sensor.camera.lines()
@@ -545,114 +552,3 @@ class Renderer:
         again = np.flatnonzero(cv2.dilate(bends, np.ones((3, 3), np.uint8))[rows, columns])
         sums[:, again] = start(again, spp)()
         return lambda: sums
-
-    def _stripe_sums(
-        self,
-        pose: SensorPose,
-        bundle: Rays,
-        after_s: Float | None,
-        pixel: UInt32,
-        sources: list[Light],
-        planes: Float | None,
-    ) -> tuple[Float, ...]:
-        """Return irradiance per ray of surfaces seen directly or in mirrors, plain and weighted for speckle.
-
-        The weights are polarisation and roughness of the surfaces. With ``planes`` of the pixels' lines, samples of
-        `render_line_light` follow.
-        """
-        total, polarised, rough = mi.Float(0.0), mi.Float(0.0), mi.Float(0.0)
-        of_line: tuple[Float, ...] = ()
-        for index, segment in enumerate(self._segments(pose, bundle, after_s)):
-            value = segment.weight * self._radiance(pose, segment, sources, after_s)
-            total += value
-            polarised += value * self.objects.polarisation(segment.si)
-            rough += value * self.objects.roughness_um(segment.si)
-            if planes is not None and index == 0:
-                of_line = self._line_sums(pose, segment, after_s, sources, value, dr.gather(mi.Vector4f, planes, pixel))
-        return total, polarised, rough, *of_line
-
-    def _line_sums(
-        self,
-        pose: SensorPose,
-        segment: RaySegment,
-        after_s: Float | None,
-        sources: list[Light],
-        value: Float,
-        plane: Vector4f,
-    ) -> tuple[Float, Float, Float]:
-        """Return samples for `render_line_light`; ``value`` is the light of all ``sources`` on the segments' ends."""
-        light = sources[0]
-        if len(sources) > 1 or len(light.sheet.parts) > 1:
-            value = segment.weight * self._radiance(pose, segment, [light], after_s, lobes=False)
-        here = light.evaluate(segment.end(), after_s)
-        away = dr.dot(mi.Vector3f(plane.x, plane.y, plane.z), mi.Vector3f(segment.si.p)) - plane.w
-        same = dr.abs(away) <= here.sigma_mm
-        profile = dr.exp(-0.5 * dr.square(here.distance_mm / here.sigma_mm))
-        profile /= here.sigma_mm * math.sqrt(2 * math.pi)
-        return value, dr.select(same, 0.0, value), dr.select(same & (value > 0), profile, 0.0)
-
-    def _render_pixels(
-        self,
-        light: Callable[..., tuple[Float, ...]],
-        pose: SensorPose,
-        rows: np.ndarray,
-        columns: np.ndarray,
-        *rest: object,
-        spp: int,
-        shifted: bool = False,
-    ) -> Callable[[], np.ndarray]:
-        """Render pixels; return a function that fetches the means (K, P) of ``light`` over pixel, pupil and exposure.
-
-        Rendering is asynchronous. ``shifted`` uses different pupil samples in neighbouring pixels, so that a blurred
-        edge shows no steps.
-        """
-        index = dr.arange(mi.UInt32, len(rows) * spp)
-        per_pixel = dr.opaque(mi.UInt32, spp)
-        pixel = index // per_pixel
-        sample = index - pixel * per_pixel
-        # Adjacent values are read together, which is much faster.
-        axes = make_lattice(spp, 2 + 2 * self.effects.defocus + (pose.travel is not None))
-        places = np.zeros((spp, 4))
-        places[:, : 2 + 2 * self.effects.defocus] = axes[: 2 + 2 * self.effects.defocus].T
-        across, down, u, v = dr.gather(mi.Vector4f, to_jit(places), sample)
-        x, y = dr.gather(mi.Point2f, to_jit(np.stack([columns, rows], axis=1)), pixel)
-        pupil = None
-        if self.effects.defocus:
-            if shifted:
-                shift_u, shift_v = dr.gather(mi.Point2f, to_jit(pupil_shifts(rows, columns).T), pixel)
-                u, v = u + shift_u, v + shift_v
-                u, v = u - dr.floor(u), v - dr.floor(v)
-            pupil = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(u, v))
-        after_s = None
-        if pose.travel is not None:
-            after_s = pose.travel.compute_times(y, dr.gather(mi.Float, to_jit(axes[-1]), sample))
-        bundle = self.view.trace_bundle(x + across - 0.5, y + down - 0.5, pupil)
-        values = light(pose, bundle, after_s, pixel, *rest)
-        dr.eval(values)  # together: separate sums would trace the rays again
-        sums = [dr.block_sum(value, spp) for value in values]
-        dr.eval(sums)
-        return lambda: np.stack([each.numpy() / spp for each in sums])
-
-    def _blur_px(self, marked: np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
-        """Return the largest blur in px at the corners of marked cells, 0 elsewhere, from the depths at all nodes."""
-        row, column = find_marked(marked)
-        corners = np.stack([depth_mm[row + down, column + right] for down, right in np.ndindex(2, 2)])
-        blur = np.zeros(marked.shape, np.float32)
-        blur[row, column] = np.fmax(np.fmax.reduce(self.view.blur_radius_px(corners)), 0)
-        return blur
-
-    def _sigmas(self, here: SheetLight, segment: RaySegment, pose: SensorPose, reach: float) -> Float:
-        """Return distances of segment ends from a sheet in ``reach`` standard deviations; infinite off surfaces."""
-        sigma = here.sigma_mm
-        if self.objects.translucent:
-            sigma = lit_sigma_mm(self.objects, segment.si, pose.object_direction(segment.si.n), here)
-        if reach != 1:
-            sigma = sigma * opaque(reach)
-        return dr.select(segment.valid, here.distance_mm / sigma, dr.inf)
-
-
-def _split_pixels(rows: np.ndarray, columns: np.ndarray, *, spp: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield pixels in parts of at most `SAMPLES_AT_ONCE` samples."""
-    if len(rows):
-        count = -(-len(rows) * spp // SAMPLES_AT_ONCE)
-        yield from zip(np.array_split(rows, count), np.array_split(columns, count), strict=True)

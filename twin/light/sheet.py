@@ -72,17 +72,17 @@ class Sheet:
     ``power_w`` is the power behind the window, before absorption. ``begins_at_z_mm`` is the smallest Z of the window's
     outer face in the OCS, before which there is no light. ``parts`` are the Gaussians across the sheet, the main one
     first. Side lobes make the lit surface ``reach`` times as wide. The sheet of another laser has its own OCS;
-    ``own_from_object`` (4, 4) transforms from the sensor's OCS to it. DesignError if part of the fan does not pass the
-    window, or the window bends the fan too unevenly.
+    ``sheet_from_object`` (4, 4) transforms from the sensor's OCS to it. DesignError if part of the fan does not pass
+    the window, or the window bends the fan too unevenly.
     """
 
     def __init__(self, sensor: Sensor, medium: Medium, laser: Laser | None = None):
-        own = sensor if laser is None else sensor.model_copy(update={"laser": laser})
-        self.own_from_object = (
-            None if laser is None else np.linalg.inv(camera_from_object(own)) @ camera_from_object(sensor)
+        described = sensor if laser is None else sensor.model_copy(update={"laser": laser})
+        self.sheet_from_object = (
+            None if laser is None else np.linalg.inv(camera_from_object(described)) @ camera_from_object(sensor)
         )
-        laser = own.laser
-        origin, angle, fan = _trace_fan(own, medium)
+        laser = described.laser
+        origin, angle, fan = _trace_fan(described, medium)
         self._origin = opaque_point(origin)
         o, d = fan.origin, fan.direction
         slope, tilt = d[1] / d[2], d[0] / d[2]
@@ -133,8 +133,8 @@ class Sheet:
         distance = (p.x - self._x0(t) - tilt * p.z) * normal.x
         stretch = dr.sqrt(1 + m * m + tilt * tilt)
         exit_mm = (p.z - self._exit_z(t)) * stretch
-        away = dr.norm(p - self._origin) - self._waist_at
-        sigma = 0.5 * self._waist * dr.sqrt(1 + dr.square(away / self._rayleigh))
+        distances_ = dr.norm(p - self._origin) - self._waist_at
+        sigma = 0.5 * self._waist * dr.sqrt(1 + dr.square(distances_ / self._rayleigh))
         # In a plane Z = const the power per length along Y is P'(m) dm / dY; normal.x projects the profile onto it.
         density = self._power.evaluate(m) / (self._dy0(t) + p.z) * normal.x
         in_middle = density / (sigma * math.sqrt(2 * math.pi)) * stretch * dr.exp(-self._extinction * exit_mm)
@@ -143,8 +143,8 @@ class Sheet:
         if len(self.parts) > 1:
             irradiance *= self.parts[0][0]
             for share, offset, radius in self.parts[1:]:
-                away = (distance / sigma - offset) / radius
-                irradiance += in_middle * (share / radius) * dr.exp(-0.5 * dr.square(away))
+                distances_ = (distance / sigma - offset) / radius
+                irradiance += in_middle * (share / radius) * dr.exp(-0.5 * dr.square(distances_))
         direction = mi.Vector3f(tilt, m, 1.0) / stretch
         return SheetLight(distance, sigma, irradiance, in_middle, direction, normal, exit_mm)
 

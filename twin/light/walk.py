@@ -51,7 +51,7 @@ class _Walks:
     """State of walks in the sensor's OCS: ray, strength and weight, and the pixel or cell to add light to.
 
     ``density`` is the probability density of the ray's direction in 1/sr if a lit surface at its end counts, else 0.
-    ``away`` is True once the walk has left the camera's ray, ``reflected`` after a reflection, ``scattered`` after
+    ``diffuse`` is True once the walk has left the camera's ray, ``reflected`` after a reflection, ``scattered`` after
     scattering by water.
     """
 
@@ -62,7 +62,7 @@ class _Walks:
     cell: UInt32
     number: UInt32
     density: Float
-    away: Bool
+    diffuse: Bool
     reflected: Bool
     scattered: Bool
 
@@ -176,12 +176,12 @@ class Walker:
         from_sheet, from_surfaces = mi.Float(0.0), mi.Float(0.0)
         passages = [light.locate_sheet(o, d, length) for light in self.lights if self.scatters]
         for light, passage in zip(self.lights, passages, strict=False):
-            from_sheet += self._scattered_by_sheet(light, passage, o, d, walks.away, rng.next_float32())
+            from_sheet += self._scatter_from_sheet(light, passage, o, d, walks.diffuse, rng.next_float32())
         for light in self.lights:
             from_surfaces += dr.exp(-c * length) * self._lit_end(light, walks, si, bsdf, end, hit)
 
         # The walk is scattered or reaches the surface, and survives Russian roulette.
-        in_water, distance, passed = self._free_path(passages, length, hit, rng)
+        in_water, distance, passed = _sample_free_path(self.scattering, passages, length, hit, self.reach_mm, rng)
         vertex = mi.Point3f(o + d * distance)
         reflected, scattered_now = cast(Bool, walks.reflected | ~in_water), cast(Bool, walks.scattered | in_water)
         here = [light.evaluate(vertex) for light in self.lights]
@@ -253,20 +253,20 @@ class Walker:
         gain = dr.select(specular, 1.0, dr.select(density > 0, value / density, 0.0))
         strength *= gain
         alive &= (strength > 0) & dr.isfinite(strength)
-        away = walks.away | ~specular
+        diffuse = walks.diffuse | ~specular
         following = replace(
             walks,
             origin=mi.Point3f(vertex + onward * dr.select(in_water, 0.0, CLEAR_MM)),
             direction=onward,
             strength=strength,
-            density=dr.select(specular | ~away, 0.0, density),
-            away=away,
+            density=dr.select(specular | ~diffuse, 0.0, density),
+            diffuse=diffuse,
             reflected=reflected,
             scattered=scattered_now,
         )
         return following, mi.Point2f(walks.weight * by_water, walks.weight * between_surfaces), alive
 
-    def _scattered_by_sheet(
+    def _scatter_from_sheet(
         self, light: Light, passage: Passage, o: Point3f, d: Vector3f, active: Bool, u: Float
     ) -> Float:
         """Return the radiance that the sheet scatters once into rays, estimated at one position of each."""
@@ -292,13 +292,8 @@ class Walker:
         radiance = bsdf.eval(mi.BSDFContext(), si, towards, active)[0] * here.irradiance
         # Both densities are per sr: per mm2, the density of a walk along its own surface is unbounded.
         by_walk = walks.density * dr.abs(mi.Frame3f.cos_theta(si.wi))
-        by_light = self._light_density(light, here, mi.Frame3f.cos_theta(towards)) * dr.square(si.t)
+        by_light = _light_density(self.scattering.c, light, here, mi.Frame3f.cos_theta(towards)) * dr.square(si.t)
         return dr.select(active & (by_walk > 0), radiance * by_walk / (by_walk + by_light), 0.0)
-
-    def _light_density(self, light: Light, here: SheetLight, cosine: Float) -> Float:
-        """Return the density per mm2 of the lit points sampled by `_connect`: the fraction of power per area."""
-        unweakened = here.irradiance * dr.exp(self.scattering.c * here.exit_mm)
-        return unweakened * dr.abs(cosine) / light.power_w
 
     def _connect(self, light: Light, vertex: Point3f, scattered, u: Point3f, active: Bool) -> Float:
         """Return the light that the vertex receives from a sampled lit point and scatters into the walk.
@@ -310,9 +305,9 @@ class Walker:
         si = self.objects.scene.ray_intersect(ray, active)
         lit = mi.Point3f(origin + towards * si.t)
         active = active & si.is_valid()
-        apart = vertex - lit
-        distance = dr.norm(apart)
-        direction = apart / distance
+        offset = vertex - lit
+        distance = dr.norm(offset)
+        direction = offset / distance
         local = si.to_local(self.pose.direction(direction))
         sent = si.bsdf().eval(mi.BSDFContext(), si, local, active)[0]
         value, density = scattered(-direction)
@@ -321,40 +316,48 @@ class Walker:
         active &= (sent * value > 0) & (distance > 2 * CLEAR_MM)
         active &= ~self.objects.scene.ray_test(shadow, active)
         here = light.evaluate(lit)
-        by_light = self._light_density(light, here, mi.Frame3f.cos_theta(si.wi))
+        by_light = _light_density(self.scattering.c, light, here, mi.Frame3f.cos_theta(si.wi))
         by_walk = density * dr.abs(mi.Frame3f.cos_theta(local)) / dr.square(distance)
         way = here.exit_mm + distance
         light_there = light.power_w * sent * dr.exp(-self.scattering.c * way) / dr.square(distance)
         return dr.select(active & (by_light > 0), value * light_there * by_light / (by_light + by_walk), 0.0)
 
-    def _free_path(self, passages: list[Passage], length: Float, hit: Bool, rng: PCG32) -> tuple[Bool, Float, Float]:
-        """Sample whether walks are scattered before the surface; return mask, distance and remaining strength.
 
-        Scattering is selected in proportion to its expected light relative to the surface, with a probability of 0.3 to
-        0.7. Distances are exponential with a decay length of at most a quarter of ``reach_mm``: in clear water,
-        scattering must not be far behind the scene. Alternatively they are sampled in inverse proportion to the
-        distance from the position nearest to the sheet, as the light of the sheet decays.
-        """
-        choice, near, u = rng.next_float32(), rng.next_float32(), rng.next_float32()
-        c = self.scattering.c
-        through = dr.exp(-c * length)
-        if not self.scatters:
-            return dr.full(mi.Bool, False, dr.width(hit)), length, dr.select(hit, through, 0.0)
-        fall = dr.maximum(c, 4 / self.reach_mm)
-        share = 1 - dr.exp(-fall * length)
-        promised = self.scattering.b / fall * share
-        likely = dr.select(hit, dr.clip(promised / (promised + 0.5 * through), 0.3, 0.7), 1.0)
-        in_water = choice < likely
-        distance = -dr.log(1 - u * share) / fall
-        each = _NEAR_SHEET / len(passages)
-        crossings = [passage.find_nearest() for passage in passages]
-        spans = [(dr.log(1 + t / apart), dr.log(1 + (length - t) / apart)) for t, apart in crossings]
-        for k, ((t, apart), (before, after)) in enumerate(zip(crossings, spans, strict=True)):
-            place = u * (before + after) - before
-            drawn = t + dr.mulsign(apart * (dr.exp(dr.abs(place)) - 1), place)
-            distance = dr.select((near >= k * each) & (near < (k + 1) * each), dr.clip(drawn, 0.0, length), distance)
-        density = (1 - _NEAR_SHEET) * fall * dr.exp(-fall * distance) / share
-        for (t, apart), (before, after) in zip(crossings, spans, strict=True):
-            density += each / ((dr.abs(distance - t) + apart) * (before + after))
-        scattered = self.scattering.b * dr.exp(-c * distance) / (density * likely)
-        return in_water, dr.select(in_water, distance, length), dr.select(in_water, scattered, through / (1 - likely))
+def _light_density(extinction: Float, light: Light, here: SheetLight, cosine: Float) -> Float:
+    """Return the density per mm2 of the lit points sampled by `Walker._connect`: the fraction of power per area."""
+    return here.irradiance * dr.exp(extinction * here.exit_mm) * dr.abs(cosine) / light.power_w
+
+
+def _sample_free_path(
+    scattering: Scattering, passages: list[Passage], length: Float, hit: Bool, reach_mm: Float, rng: PCG32
+) -> tuple[Bool, Float, Float]:
+    """Sample whether walks are scattered before the surface; return mask, distance and remaining strength.
+
+    Scattering is selected in proportion to its expected light relative to the surface, with a probability of 0.3 to
+    0.7. Distances are exponential with a decay length of at most a quarter of ``reach_mm``: in clear water,
+    scattering must not be far behind the scene. Alternatively they are sampled in inverse proportion to the
+    distance from the position nearest to the sheet, as the light of the sheet decays.
+    """
+    choice, near, u = rng.next_float32(), rng.next_float32(), rng.next_float32()
+    c = scattering.c
+    through = dr.exp(-c * length)
+    if not passages:
+        return dr.full(mi.Bool, False, dr.width(hit)), length, dr.select(hit, through, 0.0)
+    fall = dr.maximum(c, 4 / reach_mm)
+    share = 1 - dr.exp(-fall * length)
+    promised = scattering.b / fall * share
+    likely = dr.select(hit, dr.clip(promised / (promised + 0.5 * through), 0.3, 0.7), 1.0)
+    in_water = choice < likely
+    distance = -dr.log(1 - u * share) / fall
+    each = _NEAR_SHEET / len(passages)
+    crossings = [passage.find_nearest() for passage in passages]
+    spans = [(dr.log(1 + t / to_sheet), dr.log(1 + (length - t) / to_sheet)) for t, to_sheet in crossings]
+    for k, ((t, to_sheet), (before, after)) in enumerate(zip(crossings, spans, strict=True)):
+        place = u * (before + after) - before
+        drawn = t + dr.mulsign(to_sheet * (dr.exp(dr.abs(place)) - 1), place)
+        distance = dr.select((near >= k * each) & (near < (k + 1) * each), dr.clip(drawn, 0.0, length), distance)
+    density = (1 - _NEAR_SHEET) * fall * dr.exp(-fall * distance) / share
+    for (t, to_sheet), (before, after) in zip(crossings, spans, strict=True):
+        density += each / ((dr.abs(distance - t) + to_sheet) * (before + after))
+    scattered = scattering.b * dr.exp(-c * distance) / (density * likely)
+    return in_water, dr.select(in_water, distance, length), dr.select(in_water, scattered, through / (1 - likely))

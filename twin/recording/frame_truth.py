@@ -179,7 +179,7 @@ def find_crossings(renderer: Renderer, scene_from_object: np.ndarray, *, travel:
     camera = renderer.sensor.camera
     pose = SensorPose(scene_from_object, travel)
     along_width = camera.stripe_along == "width"
-    rows, columns = renderer.lit_pixels(pose)
+    rows, columns = renderer.locator.lit_pixels(pose)
     line, cell = (columns, rows) if along_width else (rows, columns)
     none, vectors = np.zeros(0), np.zeros((0, 3))
     nothing = Crossings(none.astype(int), none, none, vectors, vectors, none.astype(int))

@@ -53,7 +53,7 @@ def test_a_laser_scan_compiles_nothing_after_its_first_frame(thesis, new_kernels
     def frame(index: int, pose: np.ndarray) -> int:
         image = renderer.laser_frame(pose, spp=4 + index % 2).irradiance()
         find_true_stripe(renderer, pose)
-        return len(renderer.lit_pixels(SensorPose(pose))[0]) + 0 * len(image)
+        return len(renderer.locator.lit_pixels(SensorPose(pose))[0]) + 0 * len(image)
 
     for index in range(2):
         frame(index, sensor_at(x=0.5))

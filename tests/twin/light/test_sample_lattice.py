@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from tests.virtual_sensors import altered, clear, plate, scene_of, sensor_at
-from twin.light.image_sampling import _kernel, make_lattice, pupil_shifts
+from twin.light.image_sampling import _evaluate_kernel, make_lattice, pupil_shifts
 from twin.light.renderer import Renderer
 from twin.rendering_options import NONE
 
@@ -73,4 +73,4 @@ def test_the_error_kernel_is_its_fourier_series():
     """1 + the sum over all integers but zero of exp(2 pi i h x) / h^2; the rest of the series is 2 / 10,000 at most."""
     x, order = np.linspace(0, 1, 21), np.arange(1, 10001)[:, None]
     series = 1 + 2 * np.sum(np.cos(2 * np.pi * order * x) / order**2, axis=0)
-    np.testing.assert_allclose(_kernel(x), series, atol=2e-4)
+    np.testing.assert_allclose(_evaluate_kernel(x), series, atol=2e-4)
