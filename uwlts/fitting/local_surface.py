@@ -11,7 +11,7 @@ near the border of its disc. The variance of a sum of heights follows from the e
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from scipy.sparse import csr_array, hstack
@@ -27,19 +27,27 @@ _TERMS = 6  # of a polynomial of second order in two variables
 _AT_A_TIME = 500_000  # number of points whose normals are computed together; their matrices take 100 MB
 
 
-class PointGrid:
-    """Points (N, 3) sorted into cubes for fast neighbour searches."""
+class PointGrid(NamedTuple):
+    """Points (N, 3) sorted into cubes of size ``cell_mm`` for fast neighbour searches."""
 
-    def __init__(self, points_mm: np.ndarray, cell_mm: float):
-        self.cell_mm = cell_mm
-        self.low = points_mm.min(axis=0) - cell_mm
-        cells = np.floor((points_mm - self.low) / cell_mm).astype(np.int64)
+    points_mm: np.ndarray
+    order: np.ndarray  # (N,); numbers of the points before sorting
+    keys: np.ndarray  # (N,); cube of each point
+    low: np.ndarray  # (3,); corner of the cubes
+    shape: np.ndarray  # (3,); number of cubes along each axis
+    cell_mm: float
+
+    @classmethod
+    def sort(cls, points_mm: np.ndarray, cell_mm: float) -> Self:
+        """Sort points (N, 3) into cubes."""
+        low = points_mm.min(axis=0) - cell_mm
+        cells = np.floor((points_mm - low) / cell_mm).astype(np.int64)
         # A border of empty cubes keeps neighbour keys from wrapping around.
-        self.shape = cells.max(axis=0) + 2
-        keys = (cells[:, 0] * self.shape[1] + cells[:, 1]) * self.shape[2] + cells[:, 2]
-        self.order = np.argsort(keys, kind="stable")
-        self.keys = keys[self.order]
-        self.points_mm = np.ascontiguousarray(points_mm[self.order], dtype=np.float64)
+        shape = cells.max(axis=0) + 2
+        keys = (cells[:, 0] * shape[1] + cells[:, 1]) * shape[2] + cells[:, 2]
+        order = np.argsort(keys, kind="stable")
+        points = np.ascontiguousarray(points_mm[order], dtype=np.float64)
+        return cls(points, order, keys[order], np.asarray(low, float), shape, float(cell_mm))
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,11 +82,11 @@ class LocalPatches:
 
 def surface_normals(points_mm: np.ndarray, *, radius_mm: float, towards: np.ndarray) -> np.ndarray:
     """Return unit normals (N, 3) of planes through the points within a radius of each, oriented ``towards`` (3,)."""
-    grid, normals = PointGrid(points_mm, radius_mm), np.empty((len(points_mm), 3))
+    grid, normals = PointGrid.sort(points_mm, radius_mm), np.empty((len(points_mm), 3))
     for start in range(0, len(points_mm), _AT_A_TIME):
         places = points_mm[start : start + _AT_A_TIME].astype(np.float64)
         moments = np.empty((len(places), 6))
-        _fill_moments(places, grid.points_mm, grid.keys, grid.low, grid.shape, radius_mm, moments)
+        _fill_moments(places, grid, moments)
         matrices = moments[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
         found = np.linalg.eigh(matrices)[1][:, :, 0]
         normals[start : start + _AT_A_TIME] = np.where((found @ towards)[:, None] < 0, -found, found)
@@ -90,7 +98,7 @@ class LocalSurface:
 
     def __init__(self, surface: SurfacePoints, *, radius_mm: float):
         self.radius_mm = radius_mm
-        self._grid = grid = PointGrid(surface.points_mm, radius_mm)
+        self._grid = grid = PointGrid.sort(surface.points_mm, radius_mm)
         self._columns = tuple(
             np.ascontiguousarray(each[grid.order])
             for each in (surface.normals, surface.weight, surface.noise_mm2, surface.position_mm, surface.image)
@@ -100,33 +108,19 @@ class LocalSurface:
 
     def patches(self, places_mm: np.ndarray, *, with_uncertainty: bool = False) -> LocalPatches:
         """Fit patches at places (P, 3), each to the side of a wall that holds the nearest point."""
-        places, grid = np.ascontiguousarray(places_mm, dtype=np.float64), self._grid
+        places = np.ascontiguousarray(places_mm, dtype=np.float64)
         height, found = np.zeros(len(places)), np.zeros(len(places), np.bool_)
         normals, variance = np.zeros((len(places), 3)), np.zeros((len(places), 2))
-        scans = int(self._scan.max(initial=0)) + 1
-        fill: Any = _fit_patches
-        fill(
-            places,
-            grid.points_mm,
-            grid.keys,
-            grid.low,
-            grid.shape,
-            self.radius_mm,
-            *self._columns,
-            self._patterns if with_uncertainty else self._patterns[:, :0],
-            self._scan,
-            scans,
-            height,
-            normals,
-            found,
-            variance,
-        )
+        patterns = self._patterns if with_uncertainty else self._patterns[:, :0]
+        systematic = patterns, self._scan, int(self._scan.max(initial=0)) + 1
+        _fit_patches(places, self._grid, self._columns, systematic, (height, normals, found, variance))
         return LocalPatches(height, normals, found, np.sqrt(variance[:, 0]), np.sqrt(variance[:, 1]))
 
 
 @compiled
-def _row_range(keys, low, shape, cell, place, row):
+def _find_row(grid, place, row):
     """Return the range of sorted points in three adjacent cubes, one of the nine rows around a place."""
+    low, shape, cell, keys = grid.low, grid.shape, grid.cell_mm, grid.keys
     x = int(np.floor((place[0] - low[0]) / cell)) + row // 3 - 1
     y = int(np.floor((place[1] - low[1]) / cell)) + row % 3 - 1
     z = int(np.floor((place[2] - low[2]) / cell))
@@ -138,13 +132,14 @@ def _row_range(keys, low, shape, cell, place, row):
 
 
 @compiled
-def _fill_moments(places, points, keys, low, shape, radius, moments):
-    """Fill the second central moments (P, 6) xx, xy, xz, yy, yz, zz of the points within the radius of each place."""
+def _fill_moments(places, grid, moments):
+    """Fill the second central moments (P, 6) xx, xy, xz, yy, yz, zz of the points within a cell's size."""
+    points, radius = grid.points_mm, grid.cell_mm
     for number in range(len(places)):
         place, count = places[number], 0
         x = y = z = xx = xy = xz = yy = yz = zz = 0.0
         for row in range(9):
-            start, end = _row_range(keys, low, shape, radius, place, row)
+            start, end = _find_row(grid, place, row)
             for k in range(start, end):
                 a, b, c = points[k, 0] - place[0], points[k, 1] - place[1], points[k, 2] - place[2]
                 if a * a + b * b + c * c <= radius * radius:
@@ -160,37 +155,27 @@ def _fill_moments(places, points, keys, low, shape, radius, moments):
 
 
 @compiled_with_arrays
-def _fit_patches(
-    places,
-    points,
-    keys,
-    low,
-    shape,
-    radius,
-    normals,
-    weight,
-    noise,
-    position,
-    image,
-    patterns,
-    scan,
-    scans,
-    height,
-    fitted_normals,
-    found,
-    variance,
-):
-    """Fill heights (P,), normals (P, 3), ``found`` (P,), and variances (P, 2) by noise and by systematic errors."""
+def _fit_patches(places, grid, columns, systematic, results):
+    """Fit patches of the grid's cell size as their radius.
+
+    ``columns`` are normals, weight, noise, position and image of `SurfacePoints`; ``systematic`` are its patterns,
+    scans, and the number of scans. ``results`` are heights (P,), normals (P, 3), whether a patch is found (P,), and
+    variances (P, 2) by noise and by systematic errors.
+    """
+    points, radius = grid.points_mm, grid.cell_mm
+    normals, weight, noise, position, image = columns
+    patterns, scan, scans = systematic
+    height, fitted_normals, found, variance = results
     by = np.empty(_TERMS + 1)
     for number in range(len(places)):
         place = places[number]
         nearest, least = -1, radius * radius
         for row in range(9):
-            start, end = _row_range(keys, low, shape, radius, place, row)
+            start, end = _find_row(grid, place, row)
             for k in range(start, end):
-                away = (points[k, 0] - place[0]) ** 2 + (points[k, 1] - place[1]) ** 2 + (points[k, 2] - place[2]) ** 2
-                if away < least:
-                    nearest, least = k, away
+                dist = (points[k, 0] - place[0]) ** 2 + (points[k, 1] - place[1]) ** 2 + (points[k, 2] - place[2]) ** 2
+                if dist < least:
+                    nearest, least = k, dist
         if nearest < 0:
             continue
         normal = normals[nearest]
@@ -203,7 +188,7 @@ def _fit_patches(
         matrix, right = np.zeros((_TERMS, _TERMS)), np.zeros(_TERMS)
         count, total, left_u, left_v = 0, 0.0, 0.0, 0.0
         for row in range(9):
-            start, end = _row_range(keys, low, shape, radius, place, row)
+            start, end = _find_row(grid, place, row)
             for k in range(start, end):
                 kernel = _fill_terms(points[k], place, normal, first, second, normals[k], radius, by)
                 if kernel > 0:
@@ -228,7 +213,7 @@ def _fit_patches(
         single, images, moves, many = 0.0, np.empty(_MOST_IMAGES, np.int64), np.zeros(_MOST_IMAGES), 0
         shared = np.zeros((scans, patterns.shape[1]))
         for row in range(9):
-            start, end = _row_range(keys, low, shape, radius, place, row)
+            start, end = _find_row(grid, place, row)
             for k in range(start, end):
                 kernel = _fill_terms(points[k], place, normal, first, second, normals[k], radius, by)
                 if kernel <= 0:
@@ -264,9 +249,9 @@ def _fit_patches(
 
 
 @compiled
-def _fill_terms(point, place, normal, first, second, own, radius, by):
+def _fill_terms(point, place, normal, first, second, normal_there, radius, by):
     """Fill 1, u, v, u^2, u v, v^2 of a point (unit: radius) and its height (7,); return its kernel weight."""
-    if own[0] * normal[0] + own[1] * normal[1] + own[2] * normal[2] < _SAME_SIDE:
+    if normal_there[0] * normal[0] + normal_there[1] * normal[1] + normal_there[2] * normal[2] < _SAME_SIDE:
         return 0.0
     a, b, c = point[0] - place[0], point[1] - place[1], point[2] - place[2]
     u = (a * first[0] + b * first[1] + c * first[2]) / radius
@@ -316,8 +301,8 @@ class PatchErrors:
         """Return the variance of the sum of all heights relative to the sum of their variances, by noise or images."""
         parts = self._by_images() if by_images else [self._by_noise()]
         together = sum(float(np.sum(np.asarray(each.sum(axis=0)) ** 2)) for each in parts)
-        apart = sum(float((each * each).sum()) for each in parts)
-        return together / apart if apart > 0 else 1.0
+        single = sum(float((each * each).sum()) for each in parts)
+        return together / single if single > 0 else 1.0
 
     def _by_noise(self) -> csr_array:
         return self._sparse(self.rows * self.noise_mm[:, None] / np.sqrt(self.counts[self.near]))
@@ -346,10 +331,10 @@ def choose_disc_diameter(points_mm: np.ndarray, frame: np.ndarray | None = None)
     disc = float(2 * np.median(seventh) * np.sqrt(POINTS_PER_DISC / 6.0))
     if frame is None or (frame < 0).any() or frame.min() == frame.max():
         return disc
-    return max(disc, _IMAGES_PER_DISC * _between_images(points_mm, frame))
+    return max(disc, _IMAGES_PER_DISC * _measure_image_gap(points_mm, frame))
 
 
-def _between_images(points_mm: np.ndarray, frame: np.ndarray) -> float:
+def _measure_image_gap(points_mm: np.ndarray, frame: np.ndarray) -> float:
     """Return the median distance between a point and the nearest point of another image."""
     middle = np.unique(frame)
     chosen = np.isin(frame, middle[:: max(1, len(middle) // 20)])
@@ -367,9 +352,9 @@ def measure_spacing(places: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     sample = chosen[:: max(1, len(chosen) // _ASKED)]
     least = np.full((len(sample), 2), np.inf)
     for number, point in enumerate(sample):
-        away = np.abs(places - places[point])
+        distance = np.abs(places - places[point])
         for k in (0, 1):
-            ahead = away[:, k][away[:, k] > away[:, 1 - k]]
+            ahead = distance[:, k][distance[:, k] > distance[:, 1 - k]]
             least[number, k] = ahead.min(initial=np.inf)
     known = np.isfinite(least)
     return np.array([np.median(least[known[:, k], k]) if known[:, k].any() else 0.0 for k in (0, 1)])

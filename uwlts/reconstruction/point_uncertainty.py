@@ -23,7 +23,7 @@ from uwlts.model.parameter_keys import StageParameter
 from uwlts.model.sensor import Sensor
 from uwlts.optics.brightness import BLUR_STD, brightness_shift_std
 from uwlts.optics.line_table import LineTable, sum_terms
-from uwlts.reconstruction.path_uncertainty import principal_components
+from uwlts.reconstruction.moving import principal_components
 from uwlts.runtime.compiled import compiled
 from uwlts.storage.capture import Capture, CaptureHeader, FrameTable, sensor_poses
 from uwlts.storage.cloud import WATER, PointUncertainty
@@ -47,6 +47,7 @@ _TABLE_TOLERANCE_MM = 1e-6
 """Error of tabulated shifts, far below any relevant shift."""
 _LEFT_OUT_MM = 1e-9
 """Largest sum of omitted last terms of tables."""
+_Arrays = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def estimate_stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray) -> np.ndarray:
@@ -120,9 +121,7 @@ def _median(values: np.ndarray) -> float:
 def point_uncertainty(
     capture: Capture | FrameTable,
     calibration: Calibration,
-    frame: np.ndarray,
-    line: np.ndarray,
-    centre_px: np.ndarray,
+    centres: _Arrays,
     *,
     blur_px: np.ndarray | None = None,
     beside_mm: np.ndarray | None = None,
@@ -135,9 +134,9 @@ def point_uncertainty(
     the stage's position, scale and direction about its central position, and drift of the water since the calibration,
     unless the calibration uses this capture. It excludes errors of poses (`uwlts.reconstruction.moving`).
 
-    ``frame``, ``line`` and ``centre_px`` (N,) are image, profile line and position of each stripe centre. ``blur_px``
-    (N,) is the possible shift of the centres by blur, ``beside_mm`` (N, 3) the applied shift of the points to the
-    origin of their light (`uwlts.optics.brightness`); their relative errors are common to all points.
+    ``centres`` are image, profile line and position in px of each stripe centre, three arrays (N,). ``blur_px`` (N,) is
+    the possible shift of the centres by blur, ``beside_mm`` (N, 3) the applied shift of the points to the origin of
+    their light (`uwlts.optics.brightness`); their relative errors are common to all points.
 
     ``mount_by`` (6, P) are the derivatives of a calibrated mount by the parameters of the joint estimate
     (`uwlts.model.mount.SensorShare`), for frames with poses of a platform. They correlate the errors of points and
@@ -146,7 +145,7 @@ def point_uncertainty(
 
     CalibrationError if the calibration has no joint estimate, or cannot reconstruct the points.
     """
-    header = capture.header
+    header, (frame, line, centre_px) = capture.header, centres
     sensor = header.sensor
     scans = {scan.sha256 for scan in calibration.origin().scan_captures if scan.file == capture.path.name}
     if scans and hash_file(capture.path) in scans:
@@ -191,9 +190,9 @@ def point_uncertainty(
             series, row, at = table.combine(of_axes).shorten(_LEFT_OUT_MM).series(*where)
         random, sums = np.empty((len(row), 6), np.float32), np.empty((weights.shape[1], len(row), 3), np.float32)
         image, error, by_blur, off = (np.ascontiguousarray(each[some]) for each in (frame, noise, blur, beside))
-        of_blur, of_beside, of_stage = weights[0], weights[1], np.ascontiguousarray(by_stage.T @ weights[2:])
-        room, images = np.empty(of_axes.shape[1]), (pose_of, stage, image)
-        _fill_errors(series, row, at, *images, error, by_blur, off, of_blur, of_beside, of_stage, room, random, sums)
+        factors = weights[0], weights[1], np.ascontiguousarray(by_stage.T @ weights[2:])
+        errors, images, room = (error, by_blur, off), (pose_of, stage, image), np.empty(of_axes.shape[1])
+        _fill_errors((series, row, at), images, errors, factors, room, random, sums)
         return random, sums
 
     # Patterns are smooth over the points, so that a sample determines the principal ones.
@@ -216,28 +215,26 @@ def point_uncertainty(
 
 @compiled
 def _fill_errors(
-    series: np.ndarray,
-    row: np.ndarray,
-    at: np.ndarray,
-    turns: np.ndarray,
-    stage: np.ndarray,
-    frame: np.ndarray,
-    noise: np.ndarray,
-    blur: np.ndarray,
-    beside: np.ndarray,
-    of_blur: np.ndarray,
-    of_beside: np.ndarray,
-    of_stage: np.ndarray,
+    table: _Arrays,
+    images: _Arrays,
+    errors: _Arrays,
+    factors: _Arrays,
     flat: np.ndarray,
     random: np.ndarray,
     sums: np.ndarray,
 ) -> None:
     """Fill ``random`` (N, 6), in the order of `PAIRS`, and ``sums`` (M, N, 3); ``flat`` (3 + 3 M,) is a work array.
 
-    ``series`` (L, n, 3 + 3 M) represent, for each axis, the derivative by the pixel across the stripe and the weighted
-    sums of the estimate's error components. The arrays ``of_...``, (M,) or (3, M), are the factors of blur, brightness
-    shift and stage in these sums.
+    ``table`` are series (L, n, 3 + 3 M), and row and place (N,) of each point. The series represent, for each axis, the
+    derivative by the pixel across the stripe and the weighted sums of the estimate's error components. ``images`` are
+    rotations (F, 3, 3) and stage positions (F,) of the images, and the image (N,) of each point. ``errors`` are noise
+    and blur (N,) in px, and brightness shift (N, 3). ``factors``, (M,), (M,) and (3, M), are those of blur, brightness
+    shift and stage in the sums.
     """
+    series, row, at = table
+    turns, stage, frame = images
+    noise, blur, beside = errors
+    of_blur, of_beside, of_stage = factors
     count = sums.shape[0]
     value = flat.reshape(3, 1 + count)
     for n in range(row.size):

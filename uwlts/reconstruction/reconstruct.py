@@ -139,7 +139,9 @@ def reconstruct(
         )
         stripes = find_stripes(scan, options=stripe, progress=progress)
         table = add_platform_poses(scan, ride, mount)
-        apart, common = (None, None) if mount is None else mount.independent_covariance(calibration_digest(calibration))
+        independent, common = (
+            (None, None) if mount is None else mount.independent_covariance(calibration_digest(calibration))
+        )
         if mount is not None and common is None:
             # The mount of another calibration: its covariance contains the errors of the OCS.
             common = np.zeros((6, 0))
@@ -149,13 +151,17 @@ def reconstruct(
         warnings = [*ride.doubts, *cloud.warnings]
         if mount is None and scan.header.T_platform_sensor is not None:
             warnings = [*warnings, "the mount has its design values: calibrate it (uwlts mount) and give `mount`"]
-        own = cloud.uncertainty
-        if own is not None:
+        stated = cloud.uncertainty
+        if stated is not None:
             where = cloud.points_mm, cloud.frame, ride
-            own = add_platform_uncertainty(own, *where, mount, mount_covariance=apart, correlation_s=pose_correlation_s)
+            stated = add_platform_uncertainty(
+                stated, *where, mount, mount_covariance=independent, correlation_s=pose_correlation_s
+            )
         metadata = cloud.metadata | ({EDITED: "mount"} if mount is not None and mount.edited else {})
         metadata |= {} if ride.margins_s is None else {"trajectory_margins_s": [*ride.margins_s]}
-        return complete(cloud, uncertainty=own, warnings=warnings, metadata=metadata, time_s=scan.time_s[cloud.frame])
+        return complete(
+            cloud, uncertainty=stated, warnings=warnings, metadata=metadata, time_s=scan.time_s[cloud.frame]
+        )
 
 
 def _refuse_free_poses(scan: Capture) -> None:
@@ -201,10 +207,10 @@ def reconstruct_stripes(
         raise CalibrationError(
             "a polynomial calibration is valid only for its own medium, so a refractive index cannot be given; omit it"
         )
-    own = calibration.medium_index(capture.header.medium)
-    if index is not None and abs(index - own) > _OTHER_WATER:
-        doubts.append(f"the given `index` {index:g} is not that of the medium, {own:.5g}: is it other water?")
-    index = own if index is None else index
+    calibrated = calibration.medium_index(capture.header.medium)
+    if index is not None and abs(index - calibrated) > _OTHER_WATER:
+        doubts.append(f"the given `index` {index:g} is not that of the medium, {calibrated:.5g}: is it other water?")
+    index = calibrated if index is None else index
     require_index(index)
     lines = stripes.lines_by_status
     sharp, blur = np.arange(len(stripes.line)), np.zeros(len(stripes.line))
@@ -233,9 +239,9 @@ def reconstruct_stripes(
     if with_uncertainty:
         if exact is None:
             raise CalibrationError("the calibration states no uncertainty: calibrate jointly (`water` or `joint`)")
-        where = kept.frame, kept.line, kept.centre_px
+        centres = kept.frame, kept.line, kept.centre_px
         moved = {"blur_px": blur[good], "beside_mm": beside[good], "mount_by": mount_by}
-        known = point_uncertainty(capture, exact, *where, **moved, digest=digest)
+        known = point_uncertainty(capture, exact, centres, **moved, digest=digest)
     rays = np.bincount(found.status, minlength=len(RayStatus))
     return PointCloud(
         points_mm=points[good],
@@ -253,7 +259,7 @@ def reconstruct_stripes(
             "images": len(capture.stage_mm),
             **{key: value for key, value in capture.header.provenance.items() if key == "scene"},
             **({EDITED: "calibration"} if EDITED in calibration.provenance else {}),
-            **({} if sheet is None else _footprint_metadata(capture, sheet, stripes)),
+            **({} if sheet is None else _describe_footprint(capture, sheet, stripes)),
         },
         lines_by_status=lines,
         rays_by_status={status.name.lower(): int(rays[status]) for status in RayStatus},
@@ -277,9 +283,9 @@ def _doubt_images(stripes: CaptureStripes, *, by_stage: bool) -> list[str]:
         rows[4, line] = centre
         repeated[n] = len(line) >= FEWEST_LINES and np.array_equal(rows[3], rows[4], equal_nan=True)
         expected = np.median(rows[1:4], axis=0), 2 * rows[1] - rows[0], 2 * rows[3] - rows[4]
-        away = np.abs(rows[2] - expected).min(axis=0)
-        if np.count_nonzero(known := np.isfinite(away)) >= FEWEST_LINES:
-            beside[n - 2] = np.median(away[known])
+        deviation = np.abs(rows[2] - expected).min(axis=0)
+        if np.count_nonzero(known := np.isfinite(deviation)) >= FEWEST_LINES:
+            beside[n - 2] = np.median(deviation[known])
     bend = np.diff(stripes.centre_px, 2)[(np.diff(stripes.line, 2) == 0) & (np.diff(stripes.frame, 2) == 0)]
     noise = robust_std(np.append(bend, 0.0)) / math.sqrt(6)
     usual = float(np.quantile(beside[2:-2], _USUAL, method="lower")) if len(frames) > 4 else 0.0
@@ -343,7 +349,7 @@ def _row_delay_s(capture: Capture | FrameTable, stripes: CaptureStripes) -> np.n
     return 1e-6 * detector.line_time_us * (row - (camera.height_px - 1) / 2)
 
 
-def _footprint_metadata(capture: Capture | FrameTable, sheet: IlluminatedPoints, stripes: CaptureStripes) -> Table:
+def _describe_footprint(capture: Capture | FrameTable, sheet: IlluminatedPoints, stripes: CaptureStripes) -> Table:
     """Return metadata on the footprint of a point on the surface; empty if unknown."""
     if not np.isfinite(stripes.width_px[sheet.found.status == RayStatus.OK]).any():
         return {}
@@ -357,13 +363,13 @@ def _apply_poses(points: np.ndarray, capture: Capture | FrameTable, frame: np.nd
     posed = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
     if not posed.any():
         return points
-    own = slice(None) if posed[frame].all() else posed[frame]
-    at, direction = frame[own], np.array(capture.header.stage_direction)
-    by_sensor = points[own] - capture.stage_mm[at, None] * direction
+    with_pose = slice(None) if posed[frame].all() else posed[frame]
+    at, direction = frame[with_pose], np.array(capture.header.stage_direction)
+    by_sensor = points[with_pose] - capture.stage_mm[at, None] * direction
     placed = np.empty_like(by_sensor)
     _place(poses, at, by_sensor, placed)
     points = points.copy()
-    points[own] = placed
+    points[with_pose] = placed
     return points
 
 

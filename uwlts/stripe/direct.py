@@ -98,9 +98,9 @@ def _path_margins(
     np.maximum.at(last, number, line)
     missed = _RULE.skipped * (np.bincount(number) / (last - first + 1))[number]
     gap, skipped = _RULE.gap_lines, _RULE.skipped
-    _compute_costs(line, centre, before, after, missed, gap, jump_px, skipped, through)
-    turned = (values[::-1].copy() for values in (line.max() - line, centre, -after, -before, missed))
-    _compute_costs(*turned, gap=gap, jump_px=jump_px, skipped=skipped, result=backwards)
+    _compute_costs(line, centre, (before, after), missed, gap, jump_px, skipped, through)
+    turned, at, *slopes, lost = (each[::-1].copy() for each in (line.max() - line, centre, -after, -before, missed))
+    _compute_costs(turned, at, (slopes[0], slopes[1]), lost, gap, jump_px, skipped, backwards)
     through += backwards[::-1]
     return through - through.min()
 
@@ -117,9 +117,9 @@ def _number_stripes(line: np.ndarray, centre: np.ndarray, gap: int, jump_px: flo
             first += 1
         before, nearest, j = -1, np.inf, k - 1
         while j >= first and (before < 0 or line[j] == line[before]):
-            away = abs(centre[k] - centre[j])
-            if line[j] < line[k] and not goes_on[j] and away <= jump_px and away < nearest:
-                before, nearest = j, away
+            distance = abs(centre[k] - centre[j])
+            if line[j] < line[k] and not goes_on[j] and distance <= jump_px and distance < nearest:
+                before, nearest = j, distance
             j -= 1
         number[k] = k if before < 0 else number[before]
         if before >= 0:
@@ -136,8 +136,8 @@ def _fit_slopes(
             products, squares, j = 0.0, 0.0, k + side
             while 0 <= j < line.size and abs(line[j] - line[k]) <= gap:
                 if number[j] == number[k]:
-                    away = float(line[j] - line[k])
-                    products, squares = products + away * (centre[j] - centre[k]), squares + away * away
+                    distance = float(line[j] - line[k])
+                    products, squares = products + distance * (centre[j] - centre[k]), squares + distance * distance
                 j += side
             result[k] = products / squares if squares > 0.0 else 0.0
 
@@ -146,8 +146,7 @@ def _fit_slopes(
 def _compute_costs(
     line: np.ndarray,
     centre: np.ndarray,
-    before: np.ndarray,
-    after: np.ndarray,
+    slopes: tuple[np.ndarray, np.ndarray],
     missed: np.ndarray,
     gap: int,
     jump_px: float,
@@ -156,12 +155,12 @@ def _compute_costs(
 ) -> None:
     """Compute the cost (M,) of the best path from the first line to each candidate.
 
-    A path may continue at a candidate near the last one, or near the linear continuation of either stripe. The slopes
-    are ``before`` for the last and ``after`` for the next candidate. Otherwise it jumps.
+    A path may continue at a candidate near the last one, or near the linear continuation of either stripe: ``slopes``
+    are those before and after each candidate (`_fit_slopes`). Otherwise it jumps.
 
     A line with candidates between them costs the smaller ``missed`` of both candidates, or ``skipped`` at a jump.
     """
-    elsewhere, best_of_line, first = 0.0, np.inf, 0
+    (before, after), elsewhere, best_of_line, first = slopes, 0.0, np.inf, 0
     for k in range(line.size):
         if k > 0 and line[k] != line[k - 1]:
             elsewhere, best_of_line = min(elsewhere + skipped, best_of_line), np.inf
@@ -169,12 +168,12 @@ def _compute_costs(
             first += 1
         best, passed, j = elsewhere, -1.0, k - 1
         while j >= first:
-            apart = line[k] - line[j]
+            lines_on = line[k] - line[j]
             if line[j] != line[j + 1]:
                 passed += 1.0
-            if apart > 0:
+            if lines_on > 0:
                 moved = centre[k] - centre[j]
-                off = min(abs(moved), abs(moved - before[j] * apart), abs(moved - after[k] * apart))
+                off = min(abs(moved), abs(moved - before[j] * lines_on), abs(moved - after[k] * lines_on))
                 if off <= jump_px:
                     best = min(best, result[j] + min(missed[j], missed[k]) * passed)
             j -= 1
@@ -257,8 +256,8 @@ def _open_meetings(
             for way in (-1, 1):
                 j = k + way
                 while 0 <= j < line.size and line[j] == line[k]:
-                    apart = centre[j] - centre[k]
-                    goes_on &= abs(apart) > reach_px or apart * (apart + side * most * (slope[j] - slope[k])) > 0.0
+                    gap_px = centre[j] - centre[k]
+                    goes_on &= abs(gap_px) > reach_px or gap_px * (gap_px + side * most * (slope[j] - slope[k])) > 0.0
                     j += way
             j = k + side
             while 0 <= j < line.size and abs(line[j] - line[k]) <= most and not goes_on:

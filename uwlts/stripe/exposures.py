@@ -170,9 +170,9 @@ def fuse_exposures(
             scale *= _measure_ratio(
                 signal, longer, float(exposure_ms[k + 1] / exposure_ms[k]), low=_Rule.well_exposed * full_dn, high=low
             )
-        own = np.float32(scale**-2) * (np.clip((high - signal) / (high - low), 0.0, 1.0) if k else 1.0)
-        total += own * np.float32(scale) * signal
-        weight += own
+        part = np.float32(scale**-2) * (np.clip((high - signal) / (high - low), 0.0, 1.0) if k else 1.0)
+        total += part * np.float32(scale) * signal
+        weight += part
     return total / weight + np.float32(offset), offset + scale * (full_dn - offset)
 
 

@@ -264,10 +264,10 @@ def leave_ends_out(stripe: Stripe, options: StripeOptions) -> Stripe:
         return stripe
     place, count = stripe.centre_px[found], len(stripe.status)
     # Indices in `found` before which the stripe is interrupted.
-    apart = np.abs(place[1:] - place[:-1]) > options.jump_px
+    jumps = np.abs(place[1:] - place[:-1]) > options.jump_px
     if len(found) < count:
-        apart |= found[1:] - found[:-1] > _Rule.short_gap + 1
-    breaks = (1 + np.flatnonzero(apart)).tolist()
+        jumps |= found[1:] - found[:-1] > _Rule.short_gap + 1
+    breaks = (1 + np.flatnonzero(jumps)).tolist()
     if found[0] > _Rule.short_gap:
         breaks.append(0)
     if count - 1 - found[-1] > _Rule.short_gap:
@@ -335,11 +335,11 @@ def _search_image(
         signal = cv2.subtract(signal, background, dtype=cv2.CV_16S if image.dtype == np.uint8 else cv2.CV_32F)
     if clipped is not None:
         signal = _level_clipped(signal, clipped, stripe_along)
-        clipped = _as_profiles(clipped.view(np.uint8), stripe_along=stripe_along)
+        clipped = _turn_to_profiles(clipped.view(np.uint8), stripe_along=stripe_along)
     if (count := options.smoothing_lines) > 1:
         kernel = (1, count) if stripe_along == "height" else (count, 1)
         signal = cv2.blur(signal.astype(np.float32), kernel, borderType=cv2.BORDER_REPLICATE)
-    profiles = _as_profiles(signal, stripe_along=stripe_along)
+    profiles = _turn_to_profiles(signal, stripe_along=stripe_along)
     found = _search_profiles(profiles, options, clip, stripe_along, clipped)
     # A wider window is used only if it measures the wide stripes.
     wider, widest = options, min(options.widest_window_px, length // 4)
@@ -467,7 +467,7 @@ def _check_image(image: np.ndarray, *, name: str) -> None:
         raise ImageError(f"the {name} has {count} pixels that are not finite; repair or mask them first")
 
 
-def _as_profiles(image: np.ndarray, *, stripe_along: str) -> np.ndarray:
+def _turn_to_profiles(image: np.ndarray, *, stripe_along: str) -> np.ndarray:
     """Return a contiguous array (N, L) with the position along the line first, for operations on whole lines."""
     profiles = cv2.transpose(image) if stripe_along == "height" else np.ascontiguousarray(image).view()
     # Make all arrays read-only: compiled code is specialised for writable and for read-only arrays.

@@ -199,7 +199,7 @@ def measure_peak(smooth: np.ndarray, start: int, count: int, rules: SearchRules)
         crowded = beside < ground
         for side in (-1, 1):
             first, last = (left, begin - 1) if side < 0 else (right, end)
-            crowded |= _rises_again(smooth, first, last, side, ground, rise, rules)
+            crowded |= _has_rise(smooth, first, last, side, ground, rise, rules)
     return Peak(top, middle, sigma, reach, base, slope, highest - (base if closed else ground), closed, crowded)
 
 
@@ -222,7 +222,7 @@ def _find_least(values: np.ndarray, first: int, end: int) -> np.float32:
 
 
 @compiled_inline
-def _rises_again(
+def _has_rise(
     values: np.ndarray, first: int, end: int, step: int, ground: np.floating, rise: np.floating, rules: SearchRules
 ) -> np.bool_:
     """Return True if the profile outside a peak reaches half height, or the required fraction after a valley.

@@ -93,17 +93,24 @@ def search_profiles(
     peaks = PeakWindow.empty(lines, rules)
     status = np.full(lines, _NO_STRIPE, np.uint8)
     wide, several = np.zeros((2, lines), np.bool_)
-    count = _search_lines(profiles, board, *_make_buffers(peaks), rules, status, wide, several, peaks)
+    count = _search_lines(profiles, board, _make_buffers(peaks), rules, (status, wide, several), peaks)
     return status, wide, several, peaks.select(slice(count))
 
 
-def _make_buffers(peaks: PeakWindow) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the low-pass, and buffers for a window with borders and for the filtered window.
+class _Buffers(NamedTuple):
+    """Low-pass, and buffers for a window with borders and for the filtered window.
 
     Compiled code takes its arrays as arguments, because Numba compiles longest for arrays made in compiled code.
     """
+
+    kernel: np.ndarray
+    pixels: np.ndarray
+    smooth: np.ndarray
+
+
+def _make_buffers(peaks: PeakWindow) -> _Buffers:
     kernel, size = low_pass(peaks.smoothing), peaks.window.shape[1]
-    return kernel, np.empty(size + kernel.size - 1, np.float32), np.empty(size, np.float32)
+    return _Buffers(kernel, np.empty(size + kernel.size - 1, np.float32), np.empty(size, np.float32))
 
 
 def search_all(
@@ -119,7 +126,7 @@ def search_all(
     """
     rules, most = rules._replace(order=FIRST), _RULE.most_stripes * len(lines)
     peaks, found, clear = PeakWindow.empty(most, rules), np.empty(most, np.intp), np.empty(most, np.bool_)
-    count = _search_all(profiles, board, lines, *_make_buffers(peaks), rules, found, clear, peaks)
+    count = _search_all(profiles, board, lines, _make_buffers(peaks), rules, found, clear, peaks)
     kept = np.flatnonzero(found[:count] >= 0)
     if fewest > 1:
         kept = kept[np.bincount(found[kept])[found[kept]] >= fewest]
@@ -145,19 +152,16 @@ def mark_rivals(
 def _search_lines(
     profiles: np.ndarray,
     board: np.ndarray,
-    kernel: np.ndarray,
-    pixels: np.ndarray,
-    smooth: np.ndarray,
+    buffers: _Buffers,
     rules: SearchRules,
-    status: np.ndarray,
-    wide: np.ndarray,
-    several: np.ndarray,
+    marks: tuple[np.ndarray, np.ndarray, np.ndarray],
     peaks: PeakWindow,
 ) -> int:
-    """Fill `status`, `wide`, `several` and the windows; return the number of lines with a stripe."""
+    """Fill status, wide, several (``marks``) and the windows; return the number of lines with a stripe."""
+    status, wide, several = marks
     # Not a literal, which Numba would compile further specialisations for.
-    size, border, count = smooth.size, kernel.size // 2, int(np.intp(0))
-    window = pixels[border : border + size]
+    size, border, count = buffers.smooth.size, buffers.kernel.size // 2, int(np.intp(0))
+    window = buffers.pixels[border : border + size]
     near = window[rules.half - 1 : rules.half + rules.block + 1]
     for line in range(profiles.shape[1]):
         blocks, least, rival, of_rival = board[line], np.float32(rules.coarse), np.intp(-1), np.float32(0.0)
@@ -175,7 +179,7 @@ def _search_lines(
                 cut_window(profiles, line, start + rules.half - 1, near)
                 if _is_spike(near, there, rules.fine):
                     continue
-            start, peak = _follow_peak(profiles, line, start, kernel, pixels, window, smooth, rules)
+            start, peak = _follow_peak(profiles, line, start, buffers, window, rules)
             verdict = _classify_peak(peak, start, profiles.shape[0], rules)
             if verdict == _NO_STRIPE:
                 wide[line] |= _is_too_wide(peak, start, profiles.shape[0], rules)
@@ -185,8 +189,8 @@ def _search_lines(
                 blocks[k] = 0
             if status[line] == _OK:
                 # The flank of a wide stripe may have contrast in another block, which leads to the same stripe.
-                away = abs(start + peak.middle - (peaks.start[count] + peaks.middle[count]))
-                if away <= peaks.sigma[count] * np.float32(FWHM_PER_SIGMA):
+                distance = abs(start + peak.middle - (peaks.start[count] + peaks.middle[count]))
+                if distance <= peaks.sigma[count] * np.float32(FWHM_PER_SIGMA):
                     continue
                 if peak.height >= rules.share * peaks.height[count]:
                     status[line] = _AMBIGUOUS
@@ -229,9 +233,7 @@ def _search_all(
     profiles: np.ndarray,
     board: np.ndarray,
     lines: np.ndarray,
-    kernel: np.ndarray,
-    pixels: np.ndarray,
-    smooth: np.ndarray,
+    buffers: _Buffers,
     rules: SearchRules,
     found: np.ndarray,
     clear: np.ndarray,
@@ -239,8 +241,8 @@ def _search_all(
 ) -> int:
     """Fill `found`, `clear` and the windows of all stripes on the given lines; return the number of stripes."""
     # Not a literal, which Numba would compile further specialisations for.
-    size, border, count = smooth.size, kernel.size // 2, int(np.intp(0))
-    window = pixels[border : border + size]
+    size, border, count = buffers.smooth.size, buffers.kernel.size // 2, int(np.intp(0))
+    window = buffers.pixels[border : border + size]
     near = window[rules.half - 1 : rules.half + rules.block + 1]
     for m in range(lines.size):
         line, blocks, first = lines[m], board[m], count
@@ -255,14 +257,14 @@ def _search_all(
                 cut_window(profiles, line, start + rules.half - 1, near)
                 if _is_spike(near, np.float32(there), rules.fine):
                     continue
-            start, peak = _follow_peak(profiles, line, start, kernel, pixels, window, smooth, rules)
+            start, peak = _follow_peak(profiles, line, start, buffers, window, rules)
             verdict = _classify_peak(peak, start, profiles.shape[0], rules)
             if verdict == _NO_STRIPE and not _is_too_wide(peak, start, profiles.shape[0], rules):
                 continue
             place, known = start + peak.middle, False
             for k in range(first, count):
-                apart = abs(place - (peaks.start[k] + peaks.middle[k]))
-                known |= apart <= np.float32(FWHM_PER_SIGMA) * max(peaks.sigma[k], peak.sigma)
+                distance = abs(place - (peaks.start[k] + peaks.middle[k]))
+                known |= distance <= np.float32(FWHM_PER_SIGMA) * max(peaks.sigma[k], peak.sigma)
             if known:
                 continue
             found[count], clear[count] = line, verdict == _OK
@@ -283,27 +285,21 @@ def _ignore_minor(
     """
     for k in range(first, count):
         for j in range(first, count):
-            apart = abs(peaks.start[j] + peaks.middle[j] - peaks.start[k] - peaks.middle[k])
-            share = 1.0 if apart <= rules.half + rules.block else _RULE.minor
+            distance = abs(peaks.start[j] + peaks.middle[j] - peaks.start[k] - peaks.middle[k])
+            share = 1.0 if distance <= rules.half + rules.block else _RULE.minor
             if clear[j] and not clear[k] and peaks.height[k] <= share * peaks.height[j]:
                 found[k] = -1
 
 
 @compiled_inline
 def _follow_peak(
-    profiles: np.ndarray,
-    line: int,
-    start: int,
-    kernel: np.ndarray,
-    pixels: np.ndarray,
-    window: np.ndarray,
-    smooth: np.ndarray,
-    rules: SearchRules,
+    profiles: np.ndarray, line: int, start: int, buffers: _Buffers, window: np.ndarray, rules: SearchRules
 ) -> tuple[int, Peak]:
     """Measure the peak in the window at `start`, moved to the peak if necessary; return its start and the peak.
 
     ``window`` contains the pixels without their borders.
     """
+    kernel, pixels, smooth = buffers
     offset = 0
     while True:
         cut_window(profiles, line, start + offset, window)
@@ -311,14 +307,14 @@ def _follow_peak(
         peak = measure_peak(smooth, start + offset, profiles.shape[0], rules)
         if offset != 0:
             break
-        offset = _window_offset(peak, smooth.size, rules)
+        offset = _find_offset(peak, smooth.size, rules)
         if offset == 0:
             break
     return start + offset, peak
 
 
 @compiled_inline
-def _window_offset(peak: Peak, size: int, rules: SearchRules) -> int:
+def _find_offset(peak: Peak, size: int, rules: SearchRules) -> int:
     """Return the shift of a window that does not contain a half-height crossing or a flank of its peak."""
     to_end = np.float32(0.5 * (size - 1))
     offset = peak.middle - to_end

@@ -125,7 +125,7 @@ def test_covariances_are_those_of_monte_carlo(calibration, stripes, thesis, tmp_
     """
     frame, line, centre = stripes
     with capture_of(tmp_path, thesis, MEDIUM) as capture:
-        known = point_uncertainty(capture, calibration, frame, line, centre)
+        known = point_uncertainty(capture, calibration, (frame, line, centre))
         stored = read_stored_estimate(calibration, thesis, MEDIUM)
         stage = capture.stage_mm[frame] - capture.stage_mm[:].mean()
     pick = np.arange(0, len(line), 120)
@@ -181,8 +181,8 @@ def test_many_points_by_a_table_have_the_covariance_of_few_by_themselves(calibra
     centre = 300.0 + 80.0 * frame + 20 * np.sin(line / 200) + rng.normal(0, 0.1, len(line))
     whole = np.flatnonzero(frame == 2)
     with capture_of(tmp_path, thesis, MEDIUM, frames=6) as capture:
-        many = point_uncertainty(capture, calibration, frame, line, centre)
-        few = point_uncertainty(capture, calibration, frame[whole], line[whole], centre[whole])
+        many = point_uncertainty(capture, calibration, (frame, line, centre))
+        few = point_uncertainty(capture, calibration, (frame[whole], line[whole], centre[whole]))
     assert len(line) >= 5000 > len(whole)
     # Both omit patterns that move points by 5e-5 mm (root mean square), at most three times that at a single point.
     found, expected = many.systematic_mm2()[whole], few.systematic_mm2()
@@ -193,7 +193,7 @@ def test_many_points_by_a_table_have_the_covariance_of_few_by_themselves(calibra
 def test_random_covariance_is_the_stripes_noise_on_the_object(calibration, stripes, thesis, tmp_path):
     frame, line, centre = stripes
     with capture_of(tmp_path, thesis, MEDIUM) as capture:
-        known = point_uncertainty(capture, calibration, frame, line, centre)
+        known = point_uncertainty(capture, calibration, (frame, line, centre))
 
     def points(shift):
         pixels = np.column_stack([line, centre + shift])
@@ -227,7 +227,7 @@ def test_another_water_is_known_by_its_temperature_only(calibration, stripes, th
         folder = tmp_path / str(number)
         folder.mkdir()
         with capture_of(folder, sensor, other) as capture:
-            known = point_uncertainty(capture, calibration, frame, line, centre)
+            known = point_uncertainty(capture, calibration, (frame, line, centre))
             width = known.patterns_mm[:, 1079, 1] - known.patterns_mm[:, 0, 1]
             sizes.append(np.linalg.norm(width))
     # 20 K change the index by some 1e-3, and widths as much.
@@ -237,7 +237,7 @@ def test_another_water_is_known_by_its_temperature_only(calibration, stripes, th
 def test_a_cloud_keeps_it_in_its_file(calibration, stripes, thesis, tmp_path):
     frame, line, centre = stripes
     with capture_of(tmp_path, thesis, MEDIUM) as capture:
-        known = point_uncertainty(capture, calibration, frame, line, centre)
+        known = point_uncertainty(capture, calibration, (frame, line, centre))
     cloud = PointCloud(np.ones((len(line), 3)), np.ones(len(line)), frame, line, uncertainty=known)
     write_cloud(tmp_path / "a.full.ply", cloud)
     again = read_cloud(tmp_path / "a.full.ply").uncertainty
@@ -252,7 +252,7 @@ def test_figures_have_the_uncertainty_of_monte_carlo(calibration, stripes, thesi
     frame, line, centre = stripes
     near = frame == 0
     with capture_of(tmp_path, thesis, MEDIUM) as capture:
-        known = point_uncertainty(capture, calibration, frame[near], line[near], centre[near])
+        known = point_uncertainty(capture, calibration, (frame[near], line[near], centre[near]))
     rng = np.random.default_rng(0)
     grid = np.column_stack([rng.uniform(-20, 20, near.sum()), np.linspace(-60, 60, near.sum()), np.zeros(near.sum())])
     cloud = PointCloud(grid, np.ones(len(grid)), frame[near], line[near], uncertainty=known)
@@ -459,8 +459,8 @@ def test_residual_shifts_by_blur_and_stray_light_are_common_to_all_points(calibr
     rng = np.random.default_rng(2)
     blur, beside = rng.normal(0, 0.05, len(line)), rng.normal(0, 0.01, (len(line), 3))
     with capture_of(tmp_path, thesis, MEDIUM) as capture:
-        plain = point_uncertainty(capture, calibration, frame, line, centre)
-        known = point_uncertainty(capture, calibration, frame, line, centre, blur_px=blur, beside_mm=beside)
+        plain = point_uncertainty(capture, calibration, (frame, line, centre))
+        known = point_uncertainty(capture, calibration, (frame, line, centre), blur_px=blur, beside_mm=beside)
     per_px = noise_shifts(plain) / estimate_stripe_noise_px(frame, line, centre)[:, None]
     # Any part of what blur may do is as likely; the sheet's thickness, known to 10 %, counts by its square.
     added = [per_px * blur[:, None] / np.sqrt(3), 0.2 * beside]
@@ -485,7 +485,7 @@ def test_water_does_not_drift_before_its_own_scan(calibration, stripes, thesis, 
             }
         )
         free, tied = (
-            point_uncertainty(capture, each, frame, line, centre).systematic_mm2()[:, 5] for each in (known, own)
+            point_uncertainty(capture, each, (frame, line, centre)).systematic_mm2()[:, 5] for each in (known, own)
         )
     # 30 K are 3e-3 of the index: along Z, 0.07 mm or more.
     assert (free - tied > 0.06**2).all()
@@ -499,9 +499,9 @@ def test_clouds_of_one_calibration_state_their_shared_errors(calibration, stripe
     frame, line, centre = stripes
     moved = centre + np.where(line > 600, 90.0, -60.0)
     with capture_of(tmp_path, thesis, MEDIUM) as capture:
-        first, second = (point_uncertainty(capture, calibration, frame, line, each) for each in (centre, moved))
+        first, second = (point_uncertainty(capture, calibration, (frame, line, each)) for each in (centre, moved))
         other = point_uncertainty(
-            capture, calibration.model_copy(update={"joint": changed_joint(calibration)}), *stripes
+            capture, calibration.model_copy(update={"joint": changed_joint(calibration)}), stripes
         )
     assert first.shared.keys() == second.shared.keys() != other.shared.keys()
     ours, theirs = (np.hstack([known.shared[name] for name in first.shared]) for known in (first, second))

@@ -140,8 +140,8 @@ def _measure_flanks(peak: PeakWindow, sampled: np.ndarray, result: np.ndarray) -
     for number in range(sampled.size):
         m = sampled[number]
         near = math.floor(peak.middle[m] + np.float32(0.5))
-        for away in range(-WINDOW_RULE.flank, WINDOW_RULE.flank):
-            x = near + away + (int(peak.reach[m]) if away >= 0 else 1 - int(peak.reach[m]))
+        for offset in range(-WINDOW_RULE.flank, WINDOW_RULE.flank):
+            x = near + offset + (int(peak.reach[m]) if offset >= 0 else 1 - int(peak.reach[m]))
             x = min(max(x, 0), peak.window.shape[1] - 1)
             left = peak.window[m, x] - (peak.base[m] + peak.slope[m] * (np.float32(x) - peak.middle[m]))
             result[number] += left * left / np.float32(2 * WINDOW_RULE.flank)
@@ -222,8 +222,8 @@ def _estimate_contrast(known: np.ndarray, signal: np.ndarray, sampled: np.ndarra
         centre, height, sigma = fit[_CENTRE + k], fit[_HEIGHT + k], fit[_SIGMA + k]
         half = 0.5 * FWHM_PER_SIGMA * sigma
         for x in range(max(math.ceil(centre - half), -most), min(math.floor(centre + half), most) + 1):
-            away = (x - centre) / sigma
-            model = height * math.exp(-0.5 * away * away)
+            scaled = (x - centre) / sigma
+            model = height * math.exp(-0.5 * scaled * scaled)
             left = signal[m // _LANES, (most + x) * _LANES + k] - model
             total += (left * left - noise * noise) / (model * model)
             count += 1.0
@@ -258,9 +258,9 @@ def _sum_moments(known: np.ndarray, signal: np.ndarray, squared_contrast: np.flo
         sums[_AFTER + k], sums[_BEFORE + k], sums[_INVERSE + k] = f * after, f * before, inverse
         sums[_RISE_AFTER + k], sums[_RISE_BEFORE + k] = after * falling, before * falling
         sums[_FALLING + k], sums[_FLATNESS + k] = falling, flatness
-    for away in range(1, reach + 1):
-        y_after, y_before = signal[(most + away) * _LANES :][:_LANES], signal[(most - away) * _LANES :][:_LANES]
-        x = np.float32(away)
+    for offset in range(1, reach + 1):
+        y_after, y_before = signal[(most + offset) * _LANES :][:_LANES], signal[(most - offset) * _LANES :][:_LANES]
+        x = np.float32(offset)
         for k in range(_LANES):
             f, g = sums[_AFTER + k], sums[_BEFORE + k]
             u, t = (x - known[_CENTRE + k]) * sums[_INVERSE + k], (-x - known[_CENTRE + k]) * sums[_INVERSE + k]
@@ -368,12 +368,12 @@ def _select_least_scattered(peak: PeakWindow, centre: np.ndarray) -> np.ndarray:
     narrow = np.count_nonzero(peak.sigma[rows[::2]] < _Comparison.narrowest)
     if rows.shape[1] <= 2 * _Comparison.reach or 2 * narrow > rows[::2].size:
         return centre
-    own, of_first = _measure_scatters(peak, centre, rows[::2], zero_crossing)
-    if not of_first <= _Comparison.advantage * own:
+    scatter, of_first = _measure_scatters(peak, centre, rows[::2], zero_crossing)
+    if not of_first <= _Comparison.advantage * scatter:
         return centre
-    own, *scatters = _measure_scatters(peak, centre, rows, *others)
+    scatter, *scatters = _measure_scatters(peak, centre, rows, *others)
     best = int(np.argmin(scatters))
-    if not own - scatters[best] > max(_Comparison.gain * own, _Comparison.gain_px):
+    if not scatter - scatters[best] > max(_Comparison.gain * scatter, _Comparison.gain_px):
         return centre
     return others[best].centres(peak)
 

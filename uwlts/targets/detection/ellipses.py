@@ -125,10 +125,10 @@ def _level_planes(grey, centres, shapes, reaches):
         change = levels[near] - levels[:, None]
         like = np.abs(change) <= RULE.level_departure * np.abs(levels)[:, None]
         weight = like / like.sum(1, keepdims=True)
-        apart = centres[near] - centres[:, None]
-        apart = apart[:, :, None] - np.einsum("nks,nku->nsu", weight, apart)[:, None]
-        squares = np.einsum("nks,nksu,nksv->nsuv", weight, apart, apart)
-        products = np.einsum("nks,nksu,nks->nsu", weight, apart, change)
+        offsets = centres[near] - centres[:, None]
+        offsets = offsets[:, :, None] - np.einsum("nks,nku->nsu", weight, offsets)[:, None]
+        squares = np.einsum("nks,nksu,nksv->nsuv", weight, offsets, offsets)
+        products = np.einsum("nks,nksu,nks->nsu", weight, offsets, change)
         # Collinear places determine the slope along their line only.
         inverse = np.linalg.pinv(squares, rcond=RULE.on_a_line, hermitian=True)
         planes[:, :, 1:] = (inverse @ products[..., None])[..., 0]
@@ -196,8 +196,8 @@ class Ellipses(Blobs):
     sharpness: np.ndarray  # (N,), 1/px, slope of the edge divided by its contrast
 
     def __getitem__(self, select):
-        own = vars(self).items()
-        return Ellipses(**{name: value if name == "bright" else value[select] for name, value in own})
+        columns = vars(self).items()
+        return Ellipses(**{name: value if name == "bright" else value[select] for name, value in columns})
 
 
 def fit_ellipses(grey, blobs, noise):
@@ -255,7 +255,7 @@ def _update_ellipses(grey, ellipses, longest, noise):
     normal, right, figures = np.empty((count, 5, 5)), np.empty((count, 5)), np.empty((count, 4))
     sign, room = 1.0 if ellipses.bright else -1.0, np.empty((PROFILES, SAMPLES))
     blobs = ellipses.centres, ellipses.shapes, np.linalg.inv(ellipses.shapes), reach, share
-    _measure_edges(grey, *blobs, DIRECTIONS, sign, 6 * noise, room, normal, right, figures)
+    _measure_edges(grey, blobs, DIRECTIONS, sign, 6 * noise, room, (normal, right, figures))
     squares, contrast, slope, whole = figures[:, 0], figures[:, 1], figures[:, 2], figures[:, 3] > 0
     change = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
     rms = np.sqrt(np.maximum(squares - (right * change).sum(1), 0.0) / (PROFILES - 5))
@@ -266,16 +266,17 @@ def _update_ellipses(grey, ellipses, longest, noise):
 
 
 @compiled_with_arrays
-def _measure_edges(
-    grey, centres, shapes, inverses, reaches, shares, directions, sign, disturbed, room, normal, right, figures
-):
+def _measure_edges(grey, blobs, directions, sign, disturbed, room, results):
     """Set up normal equations (N, 5, 5), (N, 5) for changes of centre (2) and shape (3) of the ellipses.
 
-    Distances along the normals are linear in small changes. ``figures`` (N, 4) are the sum of squared distances, the
-    contrast, the edge's slope, and 1 if every profile has the contrast and falls through its middle, else 0.
+    Distances along the normals are linear in small changes. The last result is figures (N, 4): sum of squared
+    distances, contrast, slope of the edge, and whether every profile has the contrast and falls through its middle.
+    ``blobs`` are centres, shapes and their inverses, reaches, and allowed departures of the contrast.
     """
+    centres, shapes, inverses, reaches, shares = blobs
+    normal, right, figures = results
     around, samples = room.shape
-    middle, apart = samples // 2, 2.0 / (samples - 1)
+    middle, spacing = samples // 2, 2.0 / (samples - 1)
     levels = np.empty((2, around))
     for n in range(centres.shape[0]):
         shape, inverse, reach = shapes[n], inverses[n], reaches[n]
@@ -288,8 +289,8 @@ def _measure_edges(
             at_u = centres[n, 0] + shape[0, 0] * e_u + shape[0, 1] * e_v
             at_v = centres[n, 1] + shape[0, 1] * e_u + shape[1, 1] * e_v
             for s in range(samples):
-                away = step * (apart * s - 1.0)
-                room[p, s] = sign * _sample_bilinear(grey, at_u + away * n_u, at_v + away * n_v)
+                offset = step * (spacing * s - 1.0)
+                room[p, s] = sign * _sample_bilinear(grey, at_u + offset * n_u, at_v + offset * n_v)
             slope += room[p, middle - 2] - room[p, middle + 2]
             levels[0, p], levels[1, p] = (
                 (room[p, 0] + room[p, 1]) / 2,
@@ -312,9 +313,9 @@ def _measure_edges(
             nearest, crossing = float(samples), 0.0
             for s in range(samples - 1):
                 before, after = room[p, s] - level, room[p, s + 1] - level
-                away = abs(s - (samples - 2) / 2)
-                if before > 0 and after <= 0 and away < nearest:
-                    nearest, crossing = away, apart * (s + before / (before - after)) - 1.0
+                offset = abs(s - (samples - 2) / 2)
+                if before > 0 and after <= 0 and offset < nearest:
+                    nearest, crossing = offset, spacing * (s + before / (before - after)) - 1.0
             whole &= nearest < samples
             n_u, n_v = inverse[0, 0] * e_u + inverse[0, 1] * e_v, inverse[0, 1] * e_u + inverse[1, 1] * e_v
             length, distance = math.sqrt(n_u * n_u + n_v * n_v), crossing * reach
