@@ -19,7 +19,7 @@ from functools import partial
 from importlib import import_module
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -235,14 +235,25 @@ class PassAdvice:
         self.publish("\n".join([*lengths, *found.advice(), *found.doubts]))
 
 
+class ScanDevices(NamedTuple):
+    """Camera and stage of recorded scans.
+
+    ``home`` homes the stage before a scan for which it is locked, ``unlock`` accepts its position.
+    """
+
+    camera: CameraDevice
+    stage: GrblStage
+    home: bool = False
+    unlock: bool = False
+
+
 class ScanService:
     """Scans on request, one at a time, each in a thread of its own: recorded by a plan, or played from a capture.
 
     `start`, `stop` and `laser_off` return at once, with a text for the caller; they raise Error if refused. ``publish``
     is called with the points of each laser image, and the time of the image in s since the start of the scan. A played
-    capture may still be recorded by another program; it needs neither camera nor stage. ``home`` homes the stage before
-    a scan for which it is locked, ``unlock`` accepts its position. ``advice`` is computed at the end of each recorded
-    scan, as a part of it. ``scans`` is the number of scans begun.
+    capture may still be recorded by another program; it needs no ``devices``. ``advice`` is computed at the end of each
+    recorded scan, as a part of it. ``scans`` is the number of scans begun.
     """
 
     def __init__(
@@ -252,16 +263,13 @@ class ScanService:
         publish: Callable[[PointCloud, float], None],
         *,
         folder: Path = Path(),
-        camera: CameraDevice | None = None,
-        stage: GrblStage | None = None,
-        home: bool = False,
-        unlock: bool = False,
+        devices: ScanDevices | None = None,
         advice: PassAdvice | None = None,
         report: Callable[[str], None] = lambda line: None,
     ):
         self._advice = advice
         self._source, self._calibration, self._publish, self._report = source, calibration, publish, report
-        self._folder, self._camera, self._stage, self._home, self._unlock = folder, camera, stage, home, unlock
+        self._folder, self._devices = folder, devices
         self._stop, self._thread = threading.Event(), threading.Thread()
         self.scans = 0
         warm_up()
@@ -271,16 +279,16 @@ class ScanService:
         if self._thread.is_alive():
             raise HardwareError("a scan is running: stop it first")
         if isinstance(self._source, Path):
-            work, said = self._play, f"playing {self._source.name}"
+            work, text = self._play, f"playing {self._source.name}"
         else:
             path = self._free_path(self._source.title)
             check_fits(self._source.header(path.stem), self._calibration, source=path.name)
-            work, said = lambda: self._record(path), f"recording {path.name}"
+            work, text = lambda: self._record(path), f"recording {path.name}"
         self._stop.clear()
         self.scans += 1
         self._thread = threading.Thread(target=self._run, args=(work,), name="scan", daemon=True)
         self._thread.start()
-        return said
+        return text
 
     def stop(self) -> str:
         """End the scan after the present image; HardwareError if none is running."""
@@ -292,9 +300,9 @@ class ScanService:
     def laser_off(self) -> str:
         """Switch the laser off at once, which ends a scan; HardwareError if that fails."""
         self._stop.set()
-        if self._stage is None:
+        if self._devices is None:
             raise HardwareError("no laser is connected: a capture is played")
-        if not self._stage.darken():
+        if not self._devices.stage.darken():
             raise HardwareError("the laser CANNOT be switched off: switch its power off before going near")
         return "laser switched off: the next start needs a stage that is homed, or unlocked if it stood still"
 
@@ -317,17 +325,18 @@ class ScanService:
         return next(path for path in paths if not (path.exists() or part_path(path).exists()))
 
     def _record(self, out: Path) -> str:
-        plan, camera, stage = self._source, self._camera, self._stage
-        if not isinstance(plan, ScanPlan) or camera is None or stage is None:
+        plan, devices = self._source, self._devices
+        if not isinstance(plan, ScanPlan) or devices is None:
             raise HardwareError("camera and stage are not connected")
-        if not stage.position_known and self._home:
+        stage = devices.stage
+        if not stage.position_known and devices.home:
             stage.home()
-        elif not stage.position_known and self._unlock:
+        elif not stage.position_known and devices.unlock:
             stage.unlock()
         header, pose = plan.header(out.stem), self._advice and self._advice.pose
         with BackgroundView(lambda frame, number: self._show(frame, number, header)) as shown:
             listeners = ScanListeners(report=self._report, between=self._end_if_stopped, recorded=shown.put)
-            seen = record_scan(plan, out, camera=camera, stage=stage, listeners=listeners)
+            seen = record_scan(plan, out, camera=devices.camera, stage=stage, listeners=listeners)
         written = "; ".join([f"wrote {out}", *seen.warnings()])
         if self._advice is not None:
             self._report(written)
@@ -454,10 +463,11 @@ def serve_ros(
     played = not isinstance(scans, ScanPlan) and Path(scans).suffix in CAPTURES
     source = scans if isinstance(scans, ScanPlan) else Path(scans) if played else load_plan(Path(scans))
     with ExitStack() as stack:
-        opened, moved = None, None
+        devices = None
         if isinstance(source, ScanPlan):
             address, port = source.devices(camera=camera, stage=stage)
             moved, opened = stack.enter_context(GrblStage(port)), stack.enter_context(open_camera(address))
+            devices = ScanDevices(opened, moved, home, unlock)
         rclpy.init()
         stack.callback(rclpy.try_shutdown)
         node = rclpy.create_node("uwlts")
@@ -475,10 +485,7 @@ def serve_ros(
             known,
             lambda cloud, time_s: publisher.publish(clouds.message(cloud, time_s, service.scans)),
             folder=Path(folder),
-            camera=opened,
-            stage=moved,
-            home=home,
-            unlock=unlock,
+            devices=devices,
             advice=advice,
             report=lambda line: node.get_logger().info(line),
         )

@@ -241,8 +241,8 @@ class AravisCamera(CameraDevice):
                     f"the camera {self.address} has {name} = {value:g}, and does not accept {plain:g}: change it in "
                     "the camera's own program; images must be as on the image sensor, and linear in light"
                 )
-        if said := ", ".join(f"{name} was {value:g} and is now {_PLAIN[name]:g}" for name, value in changed.items()):
-            log_warnings(self.address, [f"{said}: calibrations of images with the old value do not apply"])
+        if text := ", ".join(f"{name} was {value:g} and is now {_PLAIN[name]:g}" for name, value in changed.items()):
+            log_warnings(self.address, [f"{text}: calibrations of images with the old value do not apply"])
 
     def _offers(self, name: str) -> bool:
         return bool(self._call("is_feature_available", name.encode()))
@@ -422,7 +422,7 @@ class AravisCamera(CameraDevice):
             lines = [meant.stripe(each, stripe_along="width", length_px=self.info.height_px) for each in numbers]
         except ImageError as error:
             raise HardwareError(f"the 3D camera {self.address}: {error}") from error
-        since_s = [0.0] if len(lines) == 1 else self._since_first(rows, buffer)
+        since_s = [0.0] if len(lines) == 1 else self._compute_times(rows, buffer)
         first, *later = (
             Delivered(
                 lines[row],
@@ -434,7 +434,7 @@ class AravisCamera(CameraDevice):
         )
         return replace(first, later=tuple(later))
 
-    def _since_first(self, rows: range, buffer: int) -> list[float]:
+    def _compute_times(self, rows: range, buffer: int) -> list[float]:
         """Return the times in s of a frame's profiles since the first, from their time stamps or the profile rate."""
         stamps = [each for row in rows if (each := self._chunk(buffer, "ChunkTimestamp", row)) is not None]
         # Some cameras have only one time stamp per frame.

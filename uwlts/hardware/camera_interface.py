@@ -365,7 +365,7 @@ class CameraDevice(ABC):
                 if left_s > _WAIT_S:
                     waiting()
                     continue
-                raise self._no_frame(timeout_s)
+                raise self._explain_no_frame(timeout_s)
             status = self._check.judge(frame_id=frame.frame_id, time_s=frame.time_s, complete=frame.seen is not None)
             if self.counts.renumbered and not self._renumbering_said:
                 self._renumbering_said = True
@@ -389,7 +389,7 @@ class CameraDevice(ABC):
         exposure_ms = settings.exposure_ms if frame.exposure_ms is None else frame.exposure_ms
         return GrabbedFrame(seen, time_s, frame.frame_id, exposure_ms, status, frame.encoder)
 
-    def _no_frame(self, timeout_s: float) -> HardwareError:
+    def _explain_no_frame(self, timeout_s: float) -> HardwareError:
         """Return the error for a missing frame; raises another HardwareError if the camera is gone."""
         # If the camera is gone, there is nothing left to stop.
         self._started = False

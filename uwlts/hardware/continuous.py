@@ -280,13 +280,13 @@ class _FrameReader:
             )
         stage, speed, scatters, speeds = np.full(len(times), np.nan), np.zeros(len(times)), [], []
         for one in self._passes:
-            own = (times >= _time_of(one[0])) & (times <= _time_of(one[-1])) if one else np.zeros(len(times), bool)
-            if not own.any():
+            within = (times >= _time_of(one[0])) & (times <= _time_of(one[-1])) if one else np.zeros(len(times), bool)
+            if not within.any():
                 continue
             constant = [each for each in one if even[0] <= each.position_mm <= even[1]]
-            stage[own], speed[own], scatter_s = _fit_line(constant, times[own])
+            stage[within], speed[within], scatter_s = _fit_line(constant, times[within])
             scatters.append(scatter_s)
-            speeds.append(float(speed[own][0]))
+            speeds.append(float(speed[within][0]))
         if continuous.mm_per_count is not None:
             counts = np.array(self._encoders)
             if at_rest[1] is None or not np.isfinite(counts).all():
@@ -336,11 +336,11 @@ def _fit_line(reports: list[StageReport], at_s: np.ndarray) -> tuple[np.ndarray,
     used = [each for each in reports if each.answered_s - each.asked_s <= longest]
     times, places = np.array([_time_of(each) for each in used]), np.array([each.position_mm for each in used])
     middle, kept, speed, start = times.mean(), np.ones(len(used), bool), 0.0, 0.0
-    away, fitted = places, kept
+    outside, fitted = places, kept
     for _ in range(3):
         speed, start = np.polyfit(times[kept] - middle, places[kept], 1)
-        away, fitted = places - (start + speed * (times - middle)), kept
-        kept = np.abs(away) <= DEFAULT_K * max(robust_std(away), 1e-6)
+        outside, fitted = places - (start + speed * (times - middle)), kept
+        kept = np.abs(outside) <= DEFAULT_K * max(robust_std(outside), 1e-6)
     # The line takes two degrees of freedom.
-    scatter = float(np.sqrt((away[fitted] ** 2).sum() / max(np.count_nonzero(fitted) - 2, 1)))
+    scatter = float(np.sqrt((outside[fitted] ** 2).sum() / max(np.count_nonzero(fitted) - 2, 1)))
     return start + speed * (at_s - middle), float(speed), scatter / abs(float(speed))

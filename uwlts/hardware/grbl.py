@@ -54,22 +54,15 @@ class StageReport:
     position_mm: float
 
 
-class GrblStage(GrblLine):
-    """A stage that is open after construction; a context manager that leaves the laser off. Not thread-safe.
+class GrblAxis(GrblLine):
+    """Movements of one axis: positions, limits, and checks of what the controller reports of axis and laser.
 
-    Only `darken` may be called from other threads. ``boot_s`` is the longest start-up time of a controller that
-    restarts when the port, such as /dev/ttyACM0, is opened. ``settings`` are those reported by ``$$``, ``version`` is
-    that of Grbl, and ``limits_mm`` are the lowest and highest position.
-
-    Raises HardwareError if the port cannot be opened, nothing answers, or the controller is not a Grbl 1.1 with
-    variable spindle.
+    ``settings`` are those reported by ``$$``, and ``limits_mm`` are the lowest and highest position. Raises
+    HardwareError as `GrblLine`, or if the firmware has no variable spindle.
     """
 
     def __init__(self, port: str, *, boot_s: float = 2.5):
         super().__init__(port, boot_s=boot_s)
-        self._power, self._held = 0.0, False
-        self._lighting: tuple[str, ...] = ()
-        self.lit_until_s = -math.inf
         try:
             self.settings = parse_settings(self.read_settings())
             options, travel = self.options(), self.settings.travel_mm
@@ -93,8 +86,141 @@ class GrblStage(GrblLine):
 
     @property
     def faulty(self) -> bool:
-        """True if a fault has stopped all movements and switched the laser off, until `home` or `unlock`."""
+        """True if a fault has stopped all movements and switched the laser off, until `GrblStage.home` or `unlock`."""
         return self.fault is not None
+
+    @property
+    def fastest_sweep_mm_per_s(self) -> float:
+        """Highest speed of `GrblStage.sweep`: at a higher one the stage takes too long to stop by itself."""
+        # Including the ramps the stage stops within _SWEEP_S from a distance that suffices to brake, plus _LAG_S.
+        return (_SWEEP_S - _LAG_S) / 1.5 * self.settings.acceleration_mm_per_s2
+
+    def position_mm(self) -> float:
+        """Position in mm as the controller counts it."""
+        return self._position_of(self.status())
+
+    def _go(self, position_mm: float, feed_mm_per_min: float) -> None:
+        self.command(f"G21G90G94G53G1X{self._origin_mm + position_mm:.4f}F{feed_mm_per_min:.2f}")
+
+    def _arrive(
+        self, position_mm: float, way_mm: float, feed_mm_per_min: float, watch: Callable[[Status], None]
+    ) -> float:
+        """Wait until the stage is at rest at the end of its travel, and return the position read back in mm."""
+        feed_mm_s = feed_mm_per_min / 60
+        # Distance at full speed plus two ramps: never less than the real time, however short the distance.
+        expected_s = abs(way_mm) / feed_mm_s + feed_mm_s / self.settings.acceleration_mm_per_s2
+        # Grbl acknowledges a dwell when all earlier movements are done.
+        self.command("G4P0.01", timeout_s=_MARGIN * expected_s + _MARGIN_S, watch=watch)
+        reached_mm = self._rest()
+        missing = round((reached_mm - position_mm) * self.settings.steps_per_mm)
+        if abs(missing) > 1:
+            raise self.stop_and_make_error(
+                f"missed steps: the position is {reached_mm:.3f} mm where {position_mm:.3f} mm was requested, "
+                f"{missing:+d} steps; a command or pulses were lost: check the wiring for interference, then home"
+            )
+        return reached_mm
+
+    def _motion_watch(self, start_mm: float, feed_mm_s: float) -> Callable[[Status], None]:
+        """Return a check of status reports during a movement, for a stall and for states that never end."""
+        last_mm, since = start_mm, time.monotonic()
+        patience_s = _STALL_S + _STALL_STEPS / self.settings.steps_per_mm / feed_mm_s
+
+        def check(report: Status) -> None:
+            nonlocal last_mm, since
+            self._refuse_stop(report)
+            position_mm, now = self._position_of(report), time.monotonic()
+            if report.state != "Run" or not math.isclose(position_mm, last_mm, abs_tol=1e-9):
+                last_mm, since = position_mm, now
+            elif now - since > patience_s:
+                raise self.stop_and_make_error(
+                    f"stall: the stage has been at {position_mm:.3f} mm for {now - since:.1f} s although the "
+                    "controller reports that it runs: restart the controller, then home"
+                )
+
+        return check
+
+    def _rest(self) -> float:
+        """Wait until the controller reports Idle, and return the position in mm."""
+        deadline = time.monotonic() + _MARGIN_S
+        while (report := self.status()).state != "Idle":
+            self._refuse_stop(report)
+            if time.monotonic() > deadline:
+                raise self.stop_and_make_error(
+                    f"the controller is in the state {report.state} although its movements are done"
+                )
+            time.sleep(POLL_S / 5)
+        return self._position_of(report)
+
+    def _position_of(self, report: Status) -> float:
+        for _ in range(_REPORTS_TO_OFFSET):
+            machine_mm = report.machine_mm
+            if machine_mm is None and report.work_mm is not None and self.offset_mm is not None:
+                machine_mm = report.work_mm + self.offset_mm
+            if machine_mm is not None:
+                # The report is rounded to 1 um; the controller counts steps.
+                return round(machine_mm * self.settings.steps_per_mm) / self.settings.steps_per_mm - self._origin_mm
+            report = self.status()
+        raise self.stop_and_make_error("work positions are reported without their offset (WCO): send $10=1")
+
+    def _refuse_stop(self, report: Status) -> None:
+        """Raise HardwareError if the movement cannot end in this state, or the limit switch is pressed elsewhere."""
+        advice = {
+            "Hold": "feed hold: its button was pressed, or there was noise on the line or on A1; home or unlock",
+            "Door": "the safety door is open: close it, then home or unlock",
+            # The greeting after a restart is taken for the answer to a reset that was sent at the same moment.
+            "Alarm": "locked by an alarm, or because it restarted by itself: home",
+            "Sleep": "asleep: home",
+            "Check": "in check mode, without movements: send $C",
+            "Jog": "jogging",
+        }
+        if report.state in advice:
+            raise self.stop_and_make_error(f"the controller has stopped: {advice[report.state]}")
+        if not self.settings.homing or "X" not in report.pins:
+            return
+        position_mm = self._position_of(report)
+        switch_mm = 0.0 if self.settings.homes_to_negative else self.settings.travel_mm
+        if abs(position_mm - switch_mm) > self.settings.homing_pull_off_mm + _PIN_MARGIN_MM:
+            raise self.stop_and_make_error(
+                f"missed steps: the limit switch at {switch_mm:g} mm is pressed at the position {position_mm:.3f} mm: "
+                "the motor lost steps (feed or acceleration too high, or an obstacle); home"
+            )
+
+    def _speed_of(self, power: float) -> int:
+        """Return the S word for a power; raises RangeError or HardwareError if it cannot be set."""
+        if not 0 < power <= 1:
+            raise RangeError(f"the laser's power is {power:g}; expected above 0 and up to 1")
+        if not self.settings.laser_mode:
+            raise HardwareError("laser mode is off ($32=0), so that a hold would keep the laser on: send $32=1")
+        return max(1, round(power * self.settings.spindle_max))
+
+    def _follows(self, report: Status, power: float) -> bool:
+        return report.spindle is None or abs(report.spindle - power * self.settings.spindle_max) <= 1
+
+    def _require_spindle(self, report: Status, power: float) -> None:
+        self._refuse_stop(report)
+        if not self._follows(report, power):
+            raise self.stop_and_make_error(
+                f"the laser's pin does not follow: S{report.spindle:g} is reported, "
+                f"S{power * self.settings.spindle_max:g} was sent (state {report.state}): a hold, a spindle override, "
+                "or $31 above it"
+            )
+
+
+class GrblStage(GrblAxis):
+    """A stage that is open after construction; a context manager that leaves the laser off. Not thread-safe.
+
+    Only `darken` may be called from other threads. ``boot_s`` is the longest start-up time of a controller that
+    restarts when the port, such as /dev/ttyACM0, is opened. ``version`` is that of Grbl.
+
+    Raises HardwareError if the port cannot be opened, nothing answers, or the controller is not a Grbl 1.1 with
+    variable spindle.
+    """
+
+    def __init__(self, port: str, *, boot_s: float = 2.5):
+        self._power, self._held = 0.0, False
+        self._lighting: tuple[str, ...] = ()
+        self.lit_until_s = -math.inf
+        super().__init__(port, boot_s=boot_s)
 
     @property
     def laser_power(self) -> float:
@@ -157,12 +283,6 @@ class GrblStage(GrblLine):
         self._go(position_mm, feed_mm_per_min)
         watch = self._motion_watch(start_mm, feed_mm_per_min / 60)
         return self._arrive(position_mm, position_mm - start_mm, feed_mm_per_min, watch)
-
-    @property
-    def fastest_sweep_mm_per_s(self) -> float:
-        """Highest speed of `sweep`: at a higher one the stage takes too long to stop by itself."""
-        # Including the ramps the stage stops within _SWEEP_S from a distance that suffices to brake, plus _LAG_S.
-        return (_SWEEP_S - _LAG_S) / 1.5 * self.settings.acceleration_mm_per_s2
 
     def sweep(
         self,
@@ -255,96 +375,6 @@ class GrblStage(GrblLine):
             raise HardwareError("the laser is on: switch it off before moving, or use sweep")
         return self.position_mm()
 
-    def _go(self, position_mm: float, feed_mm_per_min: float) -> None:
-        self.command(f"G21G90G94G53G1X{self._origin_mm + position_mm:.4f}F{feed_mm_per_min:.2f}")
-
-    def _arrive(
-        self, position_mm: float, way_mm: float, feed_mm_per_min: float, watch: Callable[[Status], None]
-    ) -> float:
-        """Wait until the stage is at rest at the end of its travel, and return the position read back in mm."""
-        feed_mm_s = feed_mm_per_min / 60
-        # Distance at full speed plus two ramps: never less than the real time, however short the distance.
-        expected_s = abs(way_mm) / feed_mm_s + feed_mm_s / self.settings.acceleration_mm_per_s2
-        # Grbl acknowledges a dwell when all earlier movements are done.
-        self.command("G4P0.01", timeout_s=_MARGIN * expected_s + _MARGIN_S, watch=watch)
-        reached_mm = self._rest()
-        missing = round((reached_mm - position_mm) * self.settings.steps_per_mm)
-        if abs(missing) > 1:
-            raise self.stop_and_make_error(
-                f"missed steps: the position is {reached_mm:.3f} mm where {position_mm:.3f} mm was requested, "
-                f"{missing:+d} steps; a command or pulses were lost: check the wiring for interference, then home"
-            )
-        return reached_mm
-
-    def _motion_watch(self, start_mm: float, feed_mm_s: float) -> Callable[[Status], None]:
-        """Return a check of status reports during a movement, for a stall and for states that never end."""
-        last_mm, since = start_mm, time.monotonic()
-        patience_s = _STALL_S + _STALL_STEPS / self.settings.steps_per_mm / feed_mm_s
-
-        def check(report: Status) -> None:
-            nonlocal last_mm, since
-            self._refuse_stop(report)
-            position_mm, now = self._position_of(report), time.monotonic()
-            if report.state != "Run" or not math.isclose(position_mm, last_mm, abs_tol=1e-9):
-                last_mm, since = position_mm, now
-            elif now - since > patience_s:
-                raise self.stop_and_make_error(
-                    f"stall: the stage has been at {position_mm:.3f} mm for {now - since:.1f} s although the "
-                    "controller reports that it runs: restart the controller, then home"
-                )
-
-        return check
-
-    def _rest(self) -> float:
-        """Wait until the controller reports Idle, and return the position in mm."""
-        deadline = time.monotonic() + _MARGIN_S
-        while (report := self.status()).state != "Idle":
-            self._refuse_stop(report)
-            if time.monotonic() > deadline:
-                raise self.stop_and_make_error(
-                    f"the controller is in the state {report.state} although its movements are done"
-                )
-            time.sleep(POLL_S / 5)
-        return self._position_of(report)
-
-    def position_mm(self) -> float:
-        """Position in mm as the controller counts it."""
-        return self._position_of(self.status())
-
-    def _position_of(self, report: Status) -> float:
-        for _ in range(_REPORTS_TO_OFFSET):
-            machine_mm = report.machine_mm
-            if machine_mm is None and report.work_mm is not None and self.offset_mm is not None:
-                machine_mm = report.work_mm + self.offset_mm
-            if machine_mm is not None:
-                # The report is rounded to 1 um; the controller counts steps.
-                return round(machine_mm * self.settings.steps_per_mm) / self.settings.steps_per_mm - self._origin_mm
-            report = self.status()
-        raise self.stop_and_make_error("work positions are reported without their offset (WCO): send $10=1")
-
-    def _refuse_stop(self, report: Status) -> None:
-        """Raise HardwareError if the movement cannot end in this state, or the limit switch is pressed elsewhere."""
-        advice = {
-            "Hold": "feed hold: its button was pressed, or there was noise on the line or on A1; home or unlock",
-            "Door": "the safety door is open: close it, then home or unlock",
-            # The greeting after a restart is taken for the answer to a reset that was sent at the same moment.
-            "Alarm": "locked by an alarm, or because it restarted by itself: home",
-            "Sleep": "asleep: home",
-            "Check": "in check mode, without movements: send $C",
-            "Jog": "jogging",
-        }
-        if report.state in advice:
-            raise self.stop_and_make_error(f"the controller has stopped: {advice[report.state]}")
-        if not self.settings.homing or "X" not in report.pins:
-            return
-        position_mm = self._position_of(report)
-        switch_mm = 0.0 if self.settings.homes_to_negative else self.settings.travel_mm
-        if abs(position_mm - switch_mm) > self.settings.homing_pull_off_mm + _PIN_MARGIN_MM:
-            raise self.stop_and_make_error(
-                f"missed steps: the limit switch at {switch_mm:g} mm is pressed at the position {position_mm:.3f} mm: "
-                "the motor lost steps (feed or acceleration too high, or an obstacle); home"
-            )
-
     def laser(self, on: bool, *, power: float = 1.0, at_most_s: float | None = None) -> None:
         """Switch the laser at rest and check the reported state; only the camera can show whether it emits light.
 
@@ -375,7 +405,7 @@ class GrblStage(GrblLine):
             self.command("M5")
         if not on or self._lighting:
             self._forget_light()
-            self._see_spindle(0.0)
+            self._check_spindle(0.0)
             self.report_dark()
         if not on:
             return
@@ -388,18 +418,10 @@ class GrblStage(GrblLine):
         self._lighting = f"M3S{speed}G4P{dwell_s:.3f}", "M5"
         self.lit_until_s = time.monotonic() + dwell_s
         self.begin(*self._lighting)
-        self._see_spindle(power)
+        self._check_spindle(power)
         if at_most_s is None:
             self.lit_until_s = math.inf
             self.keep_lit()
-
-    def _speed_of(self, power: float) -> int:
-        """Return the S word for a power; raises RangeError or HardwareError if it cannot be set."""
-        if not 0 < power <= 1:
-            raise RangeError(f"the laser's power is {power:g}; expected above 0 and up to 1")
-        if not self.settings.laser_mode:
-            raise HardwareError("laser mode is off ($32=0), so that a hold would keep the laser on: send $32=1")
-        return max(1, round(power * self.settings.spindle_max))
 
     def _forget_light(self) -> None:
         self._power, self._lighting, self.lit_until_s = 0.0, (), -math.inf
@@ -420,7 +442,7 @@ class GrblStage(GrblLine):
             if self.unacknowledged <= len(self._lighting):
                 self.begin(*self._lighting)
 
-    def _see_spindle(self, power: float) -> None:
+    def _check_spindle(self, power: float) -> None:
         """Check that the pin gets into the expected state, which may take the controller a few ms.
 
         An answer that comes after a timed light has ended does not show whether it shone.
@@ -434,15 +456,3 @@ class GrblStage(GrblLine):
             self._refuse_stop(report)
         else:
             self._require_spindle(report, power)
-
-    def _follows(self, report: Status, power: float) -> bool:
-        return report.spindle is None or abs(report.spindle - power * self.settings.spindle_max) <= 1
-
-    def _require_spindle(self, report: Status, power: float) -> None:
-        self._refuse_stop(report)
-        if not self._follows(report, power):
-            raise self.stop_and_make_error(
-                f"the laser's pin does not follow: S{report.spindle:g} is reported, "
-                f"S{power * self.settings.spindle_max:g} was sent (state {report.state}): a hold, a spindle override, "
-                "or $31 above it"
-            )

@@ -341,9 +341,9 @@ class GrblLine:
         while self.unacknowledged:
             if watch is not None and time.monotonic() < deadline:
                 watch(self.status())
-                reply = self._next_reply(min(deadline, time.monotonic() + POLL_S)) if self.unacknowledged else None
+                reply = self._read_reply(min(deadline, time.monotonic() + POLL_S)) if self.unacknowledged else None
             else:
-                reply = self._next_reply(deadline)
+                reply = self._read_reply(deadline)
                 if reply is None:
                     raise self.stop_and_make_error(
                         f"{line!r} was not done in {timeout_s:.1f} s: the controller hangs or is held"
@@ -385,7 +385,7 @@ class GrblLine:
             self.asked_s = time.monotonic()
             self.realtime(STATUS_QUERY)
             deadline = time.monotonic() + _QUERY_S
-            while (reply := self._next_reply(deadline)) is not None:
+            while (reply := self._read_reply(deadline)) is not None:
                 if isinstance(reply, Status):
                     self.answered_s = time.monotonic()
                     return reply
@@ -515,7 +515,7 @@ class GrblLine:
         except OSError as error:
             raise self.stop_and_make_error(f"the connection is lost: {error}; is the cable plugged in?") from error
 
-    def _next_reply(self, deadline: float) -> Reply | Status | None:
+    def _read_reply(self, deadline: float) -> Reply | Status | None:
         """Return the next reply that is not a fault, or None at the deadline."""
         line = self._read_line(deadline)
         if line is None:

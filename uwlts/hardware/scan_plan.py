@@ -153,7 +153,7 @@ class ScanPlan(RigPlan):
     continuous: Continuous | None = None
 
     @model_validator(mode="after")
-    def _one_light_in_motion(self) -> "ScanPlan":
+    def _check_light(self) -> "ScanPlan":
         if self.continuous is not None and (self.images() != [("laser", 1.0)] or self.background):
             raise ValueError(
                 "a continuous scan takes one laser image per step and no others: leave out lamp, bracket and background"

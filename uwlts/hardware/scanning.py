@@ -256,7 +256,7 @@ class _Taking:
             if light not in exposures:
                 longest_ms = self._sensor.exposure.longest_ms
                 if light == "laser":
-                    raise self._no_light(longest_ms)
+                    raise self._explain_no_light(longest_ms)
                 exposures[light] = longest_ms
 
     def _settle(self, light: Light, position_mm: float) -> None:
@@ -343,7 +343,7 @@ class _Taking:
                 self._rig.move_to(here.position_mm)
                 return
         if self._lit is None:
-            raise self._no_light(here.exposure_ms)
+            raise self._explain_no_light(here.exposure_ms)
         passed = self._without - 1
         also = f"; the {passed} images before this one have no stripe either" if passed else ""
         raise HardwareError(
@@ -351,7 +351,7 @@ class _Taking:
             f"laser on and off show the same{also}. Check its supply, key and interlock, then continue with `resume`"
         )
 
-    def _no_light(self, exposure_ms: float) -> HardwareError:
+    def _explain_no_light(self, exposure_ms: float) -> HardwareError:
         """Return the error for a scan that sees no stripe anywhere."""
         looked = select_evenly(self._positions_mm, LOOKS)
         return HardwareError(

@@ -137,8 +137,8 @@ def measure_blemish(
     depth = float(depths[deepest]) + between
     # Noise of independent points that explains the scatter of local means.
     noise = indication.noise_mm * surface.std[field.near] / surface.usual_std
-    rng, own = np.random.default_rng(SEED), errors[field.near]
-    moves = list(replace(own, single_mm=noise).draw(_Rule.draws, rng))
+    rng, here = np.random.default_rng(SEED), errors[field.near]
+    moves = list(replace(here, single_mm=noise).draw(_Rule.draws, rng))
     inside = np.arange(len(noise)) < len(indication.points)
     more = field.scatter_ratio(heights, moves[: _Rule.depth_draws], inside)
     moves = [np.where(inside, more, 1.0) * each for each in moves]
@@ -189,7 +189,7 @@ def measure_blemish(
         """Return the change of all figures by a pattern of height errors."""
         return field.figures(depths + field.depths(pattern), edge, deepest, between) - seen
 
-    common = own.by_patterns(changed)
+    common = here.by_patterns(changed)
     shared = [None] * len(seen) if common is None else common.tolist()
     length, width = plain[1], plain[2]
     kind = FeatureKind.PROTRUSION
@@ -214,6 +214,7 @@ def measure_blemish(
         beneath = field.find_total(heights, sign * beneath_mm[field.near]) - float(seen[0])
     if reason:
         values = [value if value.name == "edge depth" else value.as_bound() for value in values]
+    std_of_drop = float(np.sqrt(2) * np.median(by_noise[field.region]))
     return Blemish(
         kind,
         tuple(values),
@@ -221,7 +222,7 @@ def measure_blemish(
         extent,
         indication.points,
         field.trace_outline(depths, edge, deepest),
-        field.grid[field.find_hollows(depths, edge, std=float(np.sqrt(2) * np.median(by_noise[field.region])))],
+        field.grid[_find_hollows(depths, field.region & (depths > edge), field.shape, edge, std_of_drop)],
         measure_spacing(surface.places[field.near], np.flatnonzero(inside)),
         reason,
         beneath,
@@ -317,14 +318,14 @@ class _Field:
         cls, surface: UnrolledSurface, search: BlemishSearch, indication: Indication, *, local_mm: float = np.inf
     ) -> _Field:
         """Set up the grid and its operators around an indication; ``local_mm`` is the radius of its deepest hollow."""
-        own = surface.places[indication.points]
-        low, high = own.min(axis=0), own.max(axis=0)
+        members = surface.places[indication.points]
+        low, high = members.min(axis=0), members.max(axis=0)
         radius = 0.25 * float(np.sum(high - low))
         reach = max(_Rule.ring * radius, 3 * search.smallest_mm)
         around = surface.points_between(low - reach, high + reach)
         around = around[search.undamaged[around]]
-        away = KDTree(own).query(surface.places[around])[0]
-        around, away = around[away <= reach], away[away <= reach]
+        distance = KDTree(members).query(surface.places[around])[0]
+        around, distance = around[distance <= reach], distance[distance <= reach]
         if len(around) < _Rule.fewest_points:
             raise EvaluationError(f"{len(around)} undamaged points surround it; {_Rule.fewest_points} are needed")
         near = np.concatenate([indication.points, around])
@@ -354,7 +355,7 @@ class _Field:
             seen = sparse.csr_array(sum(parts[1:], parts[0]))
         design = np.column_stack([np.ones(len(places)), places])
         plane, outer = fit_biweight(design, heights, ring)[0], np.zeros((3, len(near)))
-        far = np.append(np.zeros(len(own), bool), away > 0.5 * reach)
+        far = np.append(np.zeros(len(members), bool), distance > 0.5 * reach)
         if np.count_nonzero(far) >= _Rule.fewest_points:
             outer = fit_biweight(design, heights, far)[0] - plane
         known = surface.places[near], size, grid + middle, shape, cell
@@ -403,9 +404,9 @@ class _Field:
         """Return the radius of the deepest hollow, from its deepest place to depths significantly below half of it."""
         smooth = self.depths(heights, steps=0)
         top = int(np.argmax(np.where(self.region, smooth, -np.inf)))
-        away = np.hypot(*(self.grid - self.grid[top]).T)
+        distance = np.hypot(*(self.grid - self.grid[top]).T)
         below = smooth < 0.5 * smooth[top] - SEARCH_RULE.edge_std * self.noise_of_means(noise_mm)
-        return float(np.min(away, where=below, initial=float(away.max()))) / _Rule.half_depth
+        return float(np.min(distance, where=below, initial=float(distance.max()))) / _Rule.half_depth
 
     def find_reason(self, surface: UnrolledSurface, depths: np.ndarray, edge: float, deepest: int) -> str | None:
         """Return why a blemish is not seen whole (places in it or beside it have no points) or not sized, or None."""
@@ -418,9 +419,9 @@ class _Field:
         near = surface.points_between(probes.min(axis=0) - 2 * self.gap_mm, probes.max(axis=0) + 2 * self.gap_mm)
         if np.any(KDTree(surface.places[near]).query(probes)[0] > self.gap_mm):
             return f"not seen whole: the points end beside it, or have a gap of {2 * self.gap_mm:.2g} mm or more in it"
-        own = KDTree(self.grid[within]).query(surface.places[near])[0] < self.cell
-        if np.count_nonzero(own) < SEARCH_RULE.points_in_smallest:
-            return f"not sized: {np.count_nonzero(own)} points show it; {SEARCH_RULE.points_in_smallest} are needed"
+        showing = KDTree(self.grid[within]).query(surface.places[near])[0] < self.cell
+        if np.count_nonzero(showing) < SEARCH_RULE.points_in_smallest:
+            return f"not sized: {np.count_nonzero(showing)} points show it; {SEARCH_RULE.points_in_smallest} are needed"
         return None
 
     def std_of_tips(self, depths: np.ndarray, deepest: int) -> float:
@@ -429,8 +430,8 @@ class _Field:
         It lies between a cone and a level disc with a kink at its rim, which are as deep as the surface there and a
         bandwidth away (rectangular distribution, GUM, 4.3.7).
         """
-        away = np.hypot(*(self.grid - self.grid[deepest]).T)
-        around = self.region & (np.abs(away - self.bandwidth) < 0.5 * self.cell)
+        distance = np.hypot(*(self.grid - self.grid[deepest]).T)
+        around = self.region & (np.abs(distance - self.bandwidth) < 0.5 * self.cell)
         drop = depths[deepest] - float(np.mean(depths[around])) if around.any() else 0.0
         r = np.minimum(np.hypot(*(self.places - self.grid[deepest]).T) / self.bandwidth, 1.0)
         # The difference of both forms: the depth is linear in the heights.
@@ -456,8 +457,8 @@ class _Field:
             left = each - self.design @ (self.plane @ each) - self.seen @ self.depths(each)
             return np.array([np.mean(np.square(left[part])) for part in (inside, ~inside)])
 
-        own, around = squares(heights) / np.maximum(np.mean([squares(each) for each in moves], axis=0), 1e-300)
-        return max(1.0, float(np.sqrt(own / max(around, 1e-300))))
+        within, around = squares(heights) / np.maximum(np.mean([squares(each) for each in moves], axis=0), 1e-300)
+        return max(1.0, float(np.sqrt(within / max(around, 1e-300))))
 
     def observe(self, bell: _Bell, shift: np.ndarray) -> np.ndarray:
         """Return the heights (n,) that the points with their footprints would measure on a shifted bell."""
@@ -485,7 +486,7 @@ class _Field:
         size = [_Rule.subdivision * (n - 1) + 1 for n in self.shape]
         return np.asarray(ndimage.zoom(self.region.reshape(self.shape), np.divide(size, self.shape), order=0))
 
-    def _contoured(self, depths: np.ndarray, edge: float, deepest: int) -> tuple[np.ndarray, np.ndarray, float]:
+    def _refine_contour(self, depths: np.ndarray, edge: float, deepest: int) -> tuple[np.ndarray, np.ndarray, float]:
         """Return depths on the finer grid, a mask of those in and beside the contour about ``deepest``, and the cell.
 
         The mask is empty if the deepest cell is not within the edge.
@@ -494,12 +495,12 @@ class _Field:
         top = tuple(_Rule.subdivision * k for k in np.unravel_index(deepest, self.shape))
         fine = np.asarray(ndimage.zoom(depths.reshape(self.shape), np.divide(size, self.shape), order=3))
         labelled: Any = ndimage.label(self.fine_region & (fine > edge), structure=np.ones((3, 3)))
-        own = (labelled[0] == labelled[0][top]) & (labelled[0][top] > 0)
-        return fine, ndimage.binary_dilation(own, structure=np.ones((3, 3))), self.cell / _Rule.subdivision
+        blemish = (labelled[0] == labelled[0][top]) & (labelled[0][top] > 0)
+        return fine, ndimage.binary_dilation(blemish, structure=np.ones((3, 3))), self.cell / _Rule.subdivision
 
     def figures(self, depths: np.ndarray, edge: float, deepest: int, between: float = 0.0) -> np.ndarray:
         """Return the depth of cell ``deepest`` and ``between`` it, length, width, area and lost area within an edge."""
-        fine, grown, cell = self._contoured(depths, edge, deepest)
+        fine, grown, cell = self._refine_contour(depths, edge, deepest)
         depth = float(depths[deepest]) + between
         if not grown.any():
             return np.array([depth, 0.0, 0.0, 0.0, 0.0])
@@ -514,45 +515,47 @@ class _Field:
         """Return the longest closed contour (L, 2) at an edge about cell ``deepest``, mm; empty if there is none."""
         from skimage.measure import find_contours
 
-        fine, grown, cell = self._contoured(depths, edge, deepest)
+        fine, grown, cell = self._refine_contour(depths, edge, deepest)
         # Beside the grid and the mask the depth is just below the edge.
         field = np.pad(np.where(grown, fine, np.minimum(fine, 0.0)), 1, constant_values=min(0.0, edge))
         found = find_contours(field, edge) if grown.any() else []
         return self.grid[0] + cell * (max(found, key=len) - 1) if found else np.zeros((0, 2))
 
-    def find_hollows(self, depths: np.ndarray, edge: float, *, std: float) -> list[int]:
-        """Return the deepest cells of neighbours in the blemish, the deepest first; none for a single hollow.
 
-        Cells are joined from the deepest on. A hollow is separate if it is clearly deeper than the saddle to a deeper
-        one: by a fraction, and by some standard deviations ``std`` of such a difference.
-        """
-        inside = self.region & (depths > edge)
-        top, saddles, kept = np.full(len(depths), -1), dict[int, float](), list[int]()
+def _find_hollows(depths: np.ndarray, inside: np.ndarray, shape: tuple[int, int], edge: float, std: float) -> list[int]:
+    """Return the deepest cells of neighbours in a blemish, the deepest first; none for a single hollow.
 
-        def root(cell: int) -> int:
-            while top[cell] != cell:
-                cell = top[cell]
-            return cell
+    ``depths`` (G,) are those of a grid, and ``inside`` (G,) is the mask of the blemish's cells below the edge.
 
-        for cell in sorted(np.flatnonzero(inside), key=lambda each: -depths[each]):
-            row, column = divmod(int(cell), self.shape[1])
-            beside = {
-                root(i * self.shape[1] + j)
-                for i in range(max(row - 1, 0), min(row + 2, self.shape[0]))
-                for j in range(max(column - 1, 0), min(column + 2, self.shape[1]))
-                if top[i * self.shape[1] + j] >= 0
-            }
-            best = max(beside, key=lambda each: depths[each], default=cell)
-            top[cell] = best
-            for other in beside - {best}:
-                top[other] = best
-                saddles[other] = float(depths[cell])
-        # Hollows that no saddle joins are separated by the edge.
-        for other in saddles | dict.fromkeys(np.flatnonzero(top == np.arange(len(top))).tolist(), 0.0):
-            drop = depths[other] - saddles.get(other, edge)
-            if drop > max((1 - _Rule.saddle) * depths[other], _Rule.saddle_std * std):
-                kept.append(other)
-        return sorted(kept, key=lambda each: -depths[each]) if len(kept) > 1 else []
+    Cells are joined from the deepest on. A hollow is separate if it is clearly deeper than the saddle to a deeper
+    one: by a fraction, and by some standard deviations ``std`` of such a difference.
+    """
+    top, saddles, kept = np.full(len(depths), -1), dict[int, float](), list[int]()
+
+    def root(cell: int) -> int:
+        while top[cell] != cell:
+            cell = top[cell]
+        return cell
+
+    for cell in sorted(np.flatnonzero(inside), key=lambda each: -depths[each]):
+        row, column = divmod(int(cell), shape[1])
+        beside = {
+            root(i * shape[1] + j)
+            for i in range(max(row - 1, 0), min(row + 2, shape[0]))
+            for j in range(max(column - 1, 0), min(column + 2, shape[1]))
+            if top[i * shape[1] + j] >= 0
+        }
+        best = max(beside, key=lambda each: depths[each], default=cell)
+        top[cell] = best
+        for other in beside - {best}:
+            top[other] = best
+            saddles[other] = float(depths[cell])
+    # Hollows that no saddle joins are separated by the edge.
+    for other in saddles | dict.fromkeys(np.flatnonzero(top == np.arange(len(top))).tolist(), 0.0):
+        drop = depths[other] - saddles.get(other, edge)
+        if drop > max((1 - _Rule.saddle) * depths[other], _Rule.saddle_std * std):
+            kept.append(other)
+    return sorted(kept, key=lambda each: -depths[each]) if len(kept) > 1 else []
 
 
 def _measure_section(profile: np.ndarray, edge: float, cell: float) -> tuple[float, float]:
@@ -591,18 +594,18 @@ def _quadratic_rows(grid: np.ndarray, places: np.ndarray, tree: KDTree, bandwidt
     number = np.array([len(each) for each in close])
     many = np.flatnonzero(number >= 9)
     points = np.concatenate([np.zeros(0, np.intp), *(np.array(close[k], np.intp) for k in many)])
-    own, starts = np.repeat(np.arange(len(many)), number[many]), np.cumsum(number[many]) - number[many]
-    u, v = ((places[points] - grid[many[own]]) / bandwidth).T
+    window, starts = np.repeat(np.arange(len(many)), number[many]), np.cumsum(number[many]) - number[many]
+    u, v = ((places[points] - grid[many[window]]) / bandwidth).T
     weight, terms = np.maximum(1 - u * u - v * v, 0), (np.ones(len(u)), u, v, u * u, u * v, v * v)
     normal = np.array([[np.add.reduceat(weight * a * b, starts) for a in terms] for b in terms]).transpose(2, 0, 1)
     regular = np.linalg.cond(normal) < 1e8
     normal[~regular] = np.eye(6)
-    first = np.linalg.solve(normal, np.eye(6)[:, :1])[own, :, 0].T
+    first = np.linalg.solve(normal, np.eye(6)[:, :1])[window, :, 0].T
     values = weight * sum(a * b for a, b in zip(terms, first, strict=True))
     # Quadratics extrapolate badly beside the points.
     regular &= np.add.reduceat(values * values, starts) < _Rule.most_variance / number[many]
-    kept, others = regular[own], np.setdiff1d(np.arange(len(grid)), many[regular])
+    kept, others = regular[window], np.setdiff1d(np.arange(len(grid)), many[regular])
     nearest: Any = tree.query(grid[others], k=3)
-    rows = np.concatenate([many[own[kept]], np.repeat(others, 3)])
+    rows = np.concatenate([many[window[kept]], np.repeat(others, 3)])
     parts = np.append(values[kept], np.full(3 * len(others), 1 / 3)), (rows, np.append(points[kept], nearest[1]))
     return sparse.csr_array(parts, shape=(len(grid), len(places)))

@@ -7,7 +7,7 @@ share a calibration of the sensor or mount share its errors. The prior correlate
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations, pairwise, permutations
@@ -158,7 +158,10 @@ class JointRegistration:
         others = [np.ones(len(each)) for each in self.patches]
         for (a, _), distances in found.items():
             others[a][distances.source] += 1
-        centres = [self._common_centres(number) for number in range(len(self.markers))]
+        centres = [
+            [marker.transform(pose, amounts) for marker in markers]
+            for markers, pose, amounts in zip(self.markers, self.poses, self.patterns, strict=True)
+        ]
         common = group_markers(centres, _SPHERE_REACH * (self.sphere_mm or 0.0))
         pairs = {}
         for a, b in combinations(range(len(self.patches)), 2):
@@ -248,10 +251,10 @@ class JointRegistration:
 
     def _height_changes(self, source: int, target: int, found: PatchDistances) -> list[tuple[int, csr_array]]:
         """Return the changes (Q, E) of distances by the independent errors of both scans, with the scans' numbers."""
-        own = self.patches[source].errors[found.source]
+        errors = self.patches[source].errors[found.source]
         # Without a known side, the normals of both surfaces may have opposite signs.
-        sign = np.sign(np.einsum("qi,qi->q", found.normals @ self.poses[source, :3, :3], own.normals))
-        parts = [(source, csr_array(diags_array(sign) @ own.height_changes()))]
+        sign = np.sign(np.einsum("qi,qi->q", found.normals @ self.poses[source, :3, :3], errors.normals))
+        parts = [(source, csr_array(diags_array(sign) @ errors.height_changes()))]
         if found.target_errors is not None:
             parts.append((target, -found.target_errors.height_changes()))
         return parts
@@ -280,32 +283,6 @@ class JointRegistration:
             pose[:3, :3] = rotation @ pose[:3, :3]
         self.patterns = [z + step[columns] for z, columns in zip(self.patterns, self.pattern_columns, strict=True)]
 
-    def require_connected(self, pairs: Sequence[tuple[int, int]], names: Sequence[str]) -> None:
-        """Raise EvaluationError if a scan is not connected with the first by overlaps."""
-        reached = {0}
-        while more := {number for pair in pairs if reached & set(pair) for number in pair} - reached:
-            reached |= more
-        if lost := [names[number] for number in range(len(names)) if number not in reached]:
-            raise EvaluationError(
-                f"{', '.join(lost)}: not connected with {names[0]} by overlaps. Give better initial poses, a larger "
-                "reach or spheres, or search for the initial poses (search)"
-            )
-
-    def _common_centres(self, number: int) -> list[MarkerSphere]:
-        """Transform the spheres of a scan into the common frame."""
-        pose, amounts, turned = self.poses[number], self.patterns[number], []
-        for marker in self.markers[number]:
-            centre = marker.centre_mm + amounts @ marker.patterns_mm
-            rotation = pose[:3, :3]
-            turned.append(
-                MarkerSphere(
-                    rotation @ centre + pose[:3, 3],
-                    rotation @ marker.covariance @ rotation.T,
-                    marker.patterns_mm @ rotation.T,
-                )
-            )
-        return turned
-
     def _pair_evidence(
         self,
         a: int,
@@ -328,13 +305,13 @@ class JointRegistration:
             by_poses = partial(self._derivatives_by_poses, source, target, found.places_mm)
             block = np.zeros((len(weight), unknown))
             block[:, : self.unknown_poses] = by_poses(found.normals)
-            own, other = (
+            shifts_there, other = (
                 self.patches[n].patterns_mm[:, chosen].transpose(1, 0, 2)
                 for n, chosen in ((source, found.source), (target, found.target))
             )
             if found.target_patterns_mm is not None:
                 other = found.target_patterns_mm
-            for number, shifts, sign in ((source, own, 1.0), (target, other, -1.0)):
+            for number, shifts, sign in ((source, shifts_there, 1.0), (target, other, -1.0)):
                 turned = shifts @ self.poses[number, :3, :3].T
                 block[:, self.pattern_columns[number]] = sign * np.einsum("qmi,qi->qm", turned, found.normals)
             rows.append((block, found.distance_mm, weight, found.std_mm))
@@ -384,7 +361,7 @@ def approach(
     reach = max(reach_mm, least)
     for done in range(ROUNDS):
         pairs = joint.collect_evidence(joint.measure_distances(reach))
-        joint.require_connected(list(pairs), names)
+        _require_connected(pairs, names)
         step = joint.solve(list(pairs.values())).step
         joint.move(step)
         progress(done + 1)
@@ -406,7 +383,7 @@ def settle(
     while True:
         distances = joint.measure_distances(reach_mm, refit=True)
         pairs = joint.collect_evidence(distances)
-        joint.require_connected(list(pairs), names)
+        _require_connected(pairs, names)
         solution = joint.solve(list(pairs.values()))
         covariance = joint.covariance(list(pairs.values()), solution)
         moves = joint.largest_move(solution, covariance)
@@ -463,3 +440,15 @@ def _prior_information(patterns: Sequence[np.ndarray], shared: Sequence[dict[str
     # Keep the matrix positive definite despite rounding and inconsistent shared parts.
     least = float(np.linalg.eigvalsh(covariance)[0]) if len(covariance) else 1.0
     return np.linalg.inv(covariance + max(_OWN_PART - least, 0.0) * np.eye(ends[-1]))
+
+
+def _require_connected(pairs: Collection[tuple[int, int]], names: Sequence[str]) -> None:
+    """Raise EvaluationError if a scan is not connected with the first by overlaps."""
+    reached = {0}
+    while more := {number for pair in pairs if reached & set(pair) for number in pair} - reached:
+        reached |= more
+    if lost := [names[number] for number in range(len(names)) if number not in reached]:
+        raise EvaluationError(
+            f"{', '.join(lost)}: not connected with {names[0]} by overlaps. Give better initial poses, a larger "
+            "reach or spheres, or search for the initial poses (search)"
+        )

@@ -25,6 +25,12 @@ class MarkerSphere:
     covariance: np.ndarray
     patterns_mm: np.ndarray
 
+    def transform(self, pose: np.ndarray, amounts: np.ndarray) -> MarkerSphere:
+        """Return the sphere shifted by amounts (M,) of its patterns, in the frame of a pose (4, 4)."""
+        rotation, centre = pose[:3, :3], self.centre_mm + amounts @ self.patterns_mm
+        covariance = rotation @ self.covariance @ rotation.T
+        return MarkerSphere(rotation @ centre + pose[:3, 3], covariance, self.patterns_mm @ rotation.T)
+
 
 def find_markers(cloud: PointCloud, diameter_mm: float) -> list[MarkerSphere]:
     """Find all spheres of the given diameter in a cloud."""
@@ -51,12 +57,12 @@ def group_markers(scans: Sequence[Sequence[MarkerSphere]], reach_mm: float) -> l
     for number, markers in enumerate(scans):
         for marker in markers:
             means = [np.mean([each.centre_mm for each in group.values()], axis=0) for group in groups]
-            away = [
+            distances = [
                 np.inf if number in group else float(np.linalg.norm(mean - marker.centre_mm))
                 for group, mean in zip(groups, means, strict=True)
             ]
-            if away and min(away) < reach_mm:
-                groups[int(np.argmin(away))][number] = marker
+            if distances and min(distances) < reach_mm:
+                groups[int(np.argmin(distances))][number] = marker
             else:
                 groups.append({number: marker})
     return [group for group in groups if len(group) > 1]

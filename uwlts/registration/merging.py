@@ -79,10 +79,10 @@ def _joint_patterns(
             about = points[number][here] - joint.middles_mm[number]
             by_shift, by_turn = root[columns[:3]].T, root[columns[3:]].T
             result += by_shift[:, None] + np.cross(by_turn[:, None], about[None])
-        own = joint.pattern_columns[number]
-        if len(own) and scan.uncertainty is not None:
+        scan_columns = joint.pattern_columns[number]
+        if len(scan_columns) and scan.uncertainty is not None:
             turned = scan.uncertainty.patterns_mm[:, here] @ joint.poses[number, :3, :3].T
-            result += np.tensordot(root[own].T, turned, axes=1)
+            result += np.tensordot(root[scan_columns].T, turned, axes=1)
         return result
 
     gram = np.zeros((root.shape[1],) * 2)

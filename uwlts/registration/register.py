@@ -294,7 +294,7 @@ def register(
     start = (
         estimate_coarse_poses([scan.points_mm for scan in scans], patches, markers, names, sphere_mm=sphere_mm)
         if search
-        else _checked_poses(poses, len(scans))
+        else _check_poses(poses, len(scans))
     )
     std = None if start_std_mm is None or start_std_deg is None else (start_std_mm, float(np.radians(start_std_deg)))
     shared = [{} if scan.uncertainty is None else scan.uncertainty.shared for scan in scans]
@@ -414,7 +414,7 @@ def _closure_rms(
     return float(np.sqrt(max(np.mean(left**2) - np.mean(noise**2), 0.0)))
 
 
-def _checked_poses(poses: np.ndarray | None, count: int) -> np.ndarray:
+def _check_poses(poses: np.ndarray | None, count: int) -> np.ndarray:
     if poses is None:
         return np.tile(np.eye(4), (count, 1, 1))
     start = np.array(poses, dtype=np.float64)

@@ -91,7 +91,8 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         self._shape, self._dtype = (camera.height_px, camera.width_px), np.dtype(dtype)
         self._lines, self._moving = camera.lines() if centre_lines else 0, moving
         self._columns: dict[str, tuple[tuple[int, ...], type]] = {COVARIANCE: ((6, 6), float)} if covariances else {}
-        self._columns |= MORE if self._version() > 1 else {}
+        self._version = VERSION if self._lines or moving else 1
+        self._columns |= MORE if self._version > 1 else {}
         # The time is written last: its length is the number of frames.
         self._columns |= PER_FRAME
         if self._dtype not in (np.uint8, np.uint16):
@@ -140,7 +141,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         try:
             with h5py.File(fresh, "w", libver="latest", locking=False) as self._file:
                 self._claim_space()
-                write_label(self._file, file_format=FORMAT, version=self._version(), header=self.header)
+                write_label(self._file, file_format=FORMAT, version=self._version, header=self.header)
                 if self._plan is not None:
                     write_plan(self._file, self._plan)
                 # The checksum detects damage that would otherwise be decompressed to another image.
@@ -172,9 +173,6 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         finally:
             fresh.unlink(missing_ok=True)
 
-    def _version(self) -> int:
-        return VERSION if self._lines or self._moving else 1
-
     def __len__(self) -> int:
         """Return the number of complete frames written."""
         return len(self._arrays["time_s"])
@@ -205,10 +203,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             raise CaptureError(
                 f"a frame at {frame.time_s} s cannot follow one at {self._last_s} s: give increasing times"
             )
-        if frame.pose is not None and (np.shape(frame.pose) != (4, 4) or not np.isfinite(frame.pose).all()):
-            raise CaptureError(f"a pose must be a finite array (4, 4); found {frame.pose}")
-        if frame.pose is not None and not is_rigid(frame.pose, within=POSE_ROUNDED):
-            raise CaptureError(f"a pose must be a rotation, a shift and 0 0 0 1; found {frame.pose.tolist()}")
+        _require_pose(frame.pose)
         if frame.pose_covariance is not None:
             if COVARIANCE not in self._columns:
                 raise CaptureError("the capture was begun without covariances of poses: begin it with covariances=True")
@@ -295,6 +290,13 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
                     forget_plan(self._part)
                 _truncate(self._part)
                 os.replace(self._part, self.path)
+
+
+def _require_pose(pose: np.ndarray | None) -> None:
+    if pose is not None and (np.shape(pose) != (4, 4) or not np.isfinite(pose).all()):
+        raise CaptureError(f"a pose must be a finite array (4, 4); found {pose}")
+    if pose is not None and not is_rigid(pose, within=POSE_ROUNDED):
+        raise CaptureError(f"a pose must be a rotation, a shift and 0 0 0 1; found {pose.tolist()}")
 
 
 def _lock(part: Path) -> BufferedReader:

@@ -19,7 +19,7 @@ from twin.devices.grbl_controller import GrblController
 from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.desk import scan
-from uwlts.desk.scan import PassAdvice, ScanService
+from uwlts.desk.scan import PassAdvice, ScanDevices, ScanService
 from uwlts.errors import CalibrationError, DescriptionError, HardwareError
 from uwlts.hardware.camera_interface import ReplayCamera
 from uwlts.hardware.grbl import GrblStage
@@ -140,9 +140,8 @@ def test_recorded_scans_are_files_and_clouds(tmp_path, lit, calibration, control
         assert (cloud.time_s == time_s).all()
 
     with GrblStage(controller.port) as stage, LoopedReplay(lit) as camera:
-        service = ScanService(
-            plan, calibration, publish, folder=tmp_path, camera=camera, stage=stage, home=True, report=said.append
-        )
+        devices = ScanDevices(camera, stage, home=True)
+        service = ScanService(plan, calibration, publish, folder=tmp_path, devices=devices, report=said.append)
         for number in (1, 2):
             assert service.start() == f"recording test-plate-00{number}.h5"
             service.wait()
@@ -159,8 +158,8 @@ def test_a_scan_without_a_pose_is_kept_but_gives_no_advice(tmp_path, lit, calibr
     advice = PassAdvice(calibration, pose_std_mm=0.01, pose_std_deg=0.005)
     plan = plan_for(tmp_path, controller, lit)
     with GrblStage(controller.port) as stage, LoopedReplay(lit) as camera:
-        devices = {"camera": camera, "stage": stage, "home": True}
-        service = ScanService(plan, calibration, Mock(), folder=tmp_path, advice=advice, report=said.append, **devices)
+        used = {"folder": tmp_path, "devices": ScanDevices(camera, stage, home=True)}
+        service = ScanService(plan, calibration, Mock(), advice=advice, report=said.append, **used)
         service.start()
         service.wait()
     assert said[-2].startswith(f"wrote {tmp_path / 'test-plate-001.h5'}"), said
@@ -199,9 +198,8 @@ def test_the_laser_off_service_ends_a_scan_with_the_laser_off(tmp_path, lit, cal
     plan = plan_for(tmp_path, controller, lit, count=90)
     with GrblStage(controller.port) as stage, LoopedReplay(lit) as camera:
         stage.home()
-        service = ScanService(
-            plan, calibration, lambda *_: begun.set(), folder=tmp_path, camera=camera, stage=stage, report=said.append
-        )
+        used = {"folder": tmp_path, "devices": ScanDevices(camera, stage)}
+        service = ScanService(plan, calibration, lambda *_: begun.set(), report=said.append, **used)
         service.start()
         assert begun.wait(30), said
         assert service.laser_off().startswith("laser switched off")

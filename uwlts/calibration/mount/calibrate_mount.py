@@ -18,6 +18,7 @@ from uwlts.calibration.mount.profile_evidence import (
     Problem,
     Scatter,
     SphereShape,
+    detect_again,
     from_sheet,
     thin,
     to_sheet,
@@ -254,7 +255,7 @@ class _Calibration:
             scatter = Scatter(*found.scatter)
             reach = 4 * float(np.hypot(np.hypot(scatter.point_mm, scatter.smooth_mm), 2 * scatter.pose_mm))
             state = found.state
-            shapes = whole.detect_again(state, self.flat, reach, self.rng)
+            shapes = detect_again(whole, state, self.flat, reach, self.rng)
             problem = whole.select_detected(shapes)
             good = np.ones(len(problem.points), dtype=bool)
             self._require_enough(len(good))
@@ -275,7 +276,7 @@ class _Calibration:
                 self.reasons.setdefault(number, f"no {self.shape.kind} found where the other poses show it")
         self._require_fit(used, found)
         points = zip(self.flat, shapes, strict=True)
-        members = [np.zeros(len(own), bool) if shape is None else shape.members for own, shape in points]
+        members = [np.zeros(len(profile), bool) if shape is None else shape.members for profile, shape in points]
         return self._summary(used, found, members)
 
     def _require_enough(self, usable: int) -> None:
@@ -341,13 +342,13 @@ class _Calibration:
         poses = []
         for number, (name, profile) in enumerate(zip(self.evidence.names, self.profiles, strict=True)):
             reason = self.reasons.get(number)
-            count, own, without = (0, None, None) if reason else next(off)
+            count, rms_mm, without = (0, None, None) if reason else next(off)
             poses.append(
                 MountPose(
                     name=name,
                     points=count,
                     points_left_out=len(profile) - count,
-                    rms_mm=own,
+                    rms_mm=rms_mm,
                     held_out_mm=without,
                     reason=reason,
                 )

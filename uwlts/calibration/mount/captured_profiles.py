@@ -96,22 +96,22 @@ def mount_covariance(
     derivatives (G, K, Q) of the residuals by the parameters of the sensor's joint estimate ``known``. The factor is for
     95 %.
     """
-    own = free @ estimate.covariance @ free.T
-    covariance, share = own, None
+    fitted = free @ estimate.covariance @ free.T
+    covariance, share = fitted, None
     if known is not None:
-        covariance, share = _add_sensor_uncertainty(own, free @ estimate.propagate(moved()), rotation, known)
-    estimated = np.flatnonzero(np.diag(own)[:6] > 0)
-    shares = (np.diag(own) / np.where(np.diag(covariance) > 0, np.diag(covariance), 1.0))[estimated]
+        covariance, share = _add_sensor_uncertainty(fitted, free @ estimate.propagate(moved()), rotation, known)
+    estimated = np.flatnonzero(np.diag(fitted)[:6] > 0)
+    shares = (np.diag(fitted) / np.where(np.diag(covariance) > 0, np.diag(covariance), 1.0))[estimated]
     return (covariance + covariance.T) / 2, share, estimate.coverage_factor(shares, free[estimated])
 
 
 def _add_sensor_uncertainty(
-    own: np.ndarray, by_parameters: np.ndarray, rotation: np.ndarray, known: StoredEstimate
+    estimated: np.ndarray, by_parameters: np.ndarray, rotation: np.ndarray, known: StoredEstimate
 ) -> tuple[np.ndarray, SensorShare]:
     """Add the uncertainty of the sensor's calibration to the covariance (K, K) of a mount.
 
-    ``own`` (K, K) is the covariance without the sensor's uncertainty, ``by_parameters`` (K, Q) the derivatives by the
-    joint estimate's parameters. Both start with shift and rotation of the mount; ``rotation`` (3, 3) is the mount's.
+    ``estimated`` (K, K) is the covariance without the sensor's uncertainty, ``by_parameters`` (K, Q) the derivatives by
+    the joint estimate's parameters. Both start with shift and rotation of the mount, whose rotation is ``rotation``.
     The mount maps from the sensor's frame (OCS) of the true sheet, so the uncertainty of this frame is included.
     """
     joint = known.calibration.joint
@@ -120,13 +120,13 @@ def _add_sensor_uncertainty(
     # Uncertainty that is not part of the calibration: drift of the water's index, or another water.
     besides = known.covariance.copy()
     besides[:count, :count] -= joint.covariance_matrix()
-    apart = own + by_parameters @ besides @ by_parameters.T
+    independent = estimated + by_parameters @ besides @ by_parameters.T
     in_true_frame, frame = by_parameters.copy(), known.frame_by
     in_true_frame[:6] += np.vstack([rotation @ frame[:3], rotation @ frame[3:]])
-    total = own + in_true_frame @ known.covariance @ in_true_frame.T
+    total = estimated + in_true_frame @ known.covariance @ in_true_frame.T
     share = SensorShare(
         calibration=calibration_digest(known.calibration),
         by_parameters=tuple(tuple(row) for row in by_parameters[:6, :count].tolist()),
-        covariance_apart=tuple(tuple(row) for row in ((apart + apart.T) / 2)[:6, :6].tolist()),
+        covariance_apart=tuple(tuple(row) for row in ((independent + independent.T) / 2)[:6, :6].tolist()),
     )
     return (total + total.T) / 2, share

@@ -323,9 +323,9 @@ class BoardEvidence(GroupedEvidence[_State]):
     def residuals(self, state: _State, step: np.ndarray | None = None) -> np.ndarray:
         """Return each image's deviation (K, 6) from the common target pose: shift (mm) and rotation (rad)."""
         mount, common = state if step is None else self.apply_step(state, step)
-        own = self._platforms @ mount @ self._sensor_from_target
-        shift = (own - common)[:, :3] @ np.append(self.middle, 1.0)
-        return np.hstack([shift, Rotation.from_matrix(own[:, :3, :3] @ common[:3, :3].T).as_rotvec()])
+        boards = self._platforms @ mount @ self._sensor_from_target
+        shift = (boards - common)[:, :3] @ np.append(self.middle, 1.0)
+        return np.hstack([shift, Rotation.from_matrix(boards[:, :3, :3] @ common[:3, :3].T).as_rotvec()])
 
     def covariance(self, state: _State) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
         both, middle = self._by_images(state[0]), state[1][:3] @ np.append(self.middle, 1.0)
@@ -371,8 +371,8 @@ class BoardEvidence(GroupedEvidence[_State]):
     def typical_miss(self, state: _State) -> float:
         """Return the median deviation over the images, of the target's middle and of points beside it, mm."""
         left = self.residuals(state)
-        away = np.linalg.norm(self._sensor_from_target[:, :3, 3], axis=1) + 1.0
-        return float(np.median(np.linalg.norm(left[:, :3], axis=1) + away * np.linalg.norm(left[:, 3:], axis=1)))
+        distance = np.linalg.norm(self._sensor_from_target[:, :3, 3], axis=1) + 1.0
+        return float(np.median(np.linalg.norm(left[:, :3], axis=1) + distance * np.linalg.norm(left[:, 3:], axis=1)))
 
     def offsets_mm(self, state: _State) -> np.ndarray:
         """Return the distances (K,) of the target's middle in each image from the common place."""

@@ -74,18 +74,18 @@ def _generate_candidates(
                 there = turned @ platform + state.scale * positions[nearest]
                 off = problem.shape.distances(state.artefact, there[None])[0]
                 position = positions[nearest] - off * normal / state.scale
-                points = _on_plane(points, seen, turned @ state.rotation, normal, sheet)
+                points = _move_to_plane(points, seen, turned @ state.rotation, normal, sheet)
             if points is None:
                 continue
             # Without a trajectory the pose has no information on the time offset.
             at = turned[None], position[None]
             alone = replace(problem, points=[points], motion=lambda offset, at=at: at)
             added = RestrictedEstimate(alone, state, np.array(scatter))
-            words = (
+            text = (
                 f"turn the platform by {np.degrees(side * _TURN_RAD):+.0f} deg about its {'xyz'[axis]} axis from pose "
                 f"{names[nearest]}, with the {problem.shape.kind} {where}"
             )
-            yield Candidate(words=words, information=added.information[0], pose=rigid_transform(turned, position))
+            yield Candidate(words=text, information=added.information[0], pose=rigid_transform(turned, position))
 
 
 def _views(problem: Problem, state: MountState, sheet: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, str]]:
@@ -116,7 +116,7 @@ def _views(problem: Problem, state: MountState, sheet: np.ndarray) -> list[tuple
     return [(points, place, where(*place)) for points, place in both]
 
 
-def _on_plane(
+def _move_to_plane(
     points: np.ndarray, seen: np.ndarray, to_base: np.ndarray, normal: np.ndarray, sheet: np.ndarray
 ) -> np.ndarray | None:
     """Move points along the sheet's z axis onto the plane through ``seen``; None if it is steeper than 60 deg."""

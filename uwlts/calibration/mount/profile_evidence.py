@@ -132,6 +132,44 @@ class Scatter(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
+class ProfileBins:
+    """Bins along P profiles with some numbers of points each."""
+
+    points: np.ndarray  # (P,); numbers of points
+
+    @cached_property
+    def _places(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """First point (B,) of each bin, its number of points, its profile, and its number in the profile."""
+        bins = np.minimum(_BINS, self.points)
+        profiles, places = np.repeat(np.arange(len(bins)), bins), np.concatenate([np.arange(count) for count in bins])
+        first = (np.cumsum(self.points) - self.points)[profiles]
+        first = first + (places * (self.points / bins)[profiles]).astype(int)
+        return first, np.diff(first, append=self.points.sum()), profiles, places
+
+    def means(self, values: np.ndarray) -> np.ndarray:
+        """Return means (P, K, ...) of values (N, ...) in bins along the profiles, padded with 0."""
+        starts, counts, profiles, places = self._places
+        result = np.zeros((len(self.points), int(places.max()) + 1, *values.shape[1:]))
+        sums = np.add.reduceat(values, starts, axis=0)
+        result[profiles, places] = sums / counts.reshape(-1, *[1] * (values.ndim - 1))
+        return result
+
+    @cached_property
+    def counts(self) -> np.ndarray:
+        """Numbers of points (P, K) in the bins, 0 where a profile has fewer bins."""
+        _, sizes, profiles, places = self._places
+        counts = np.zeros((len(self.points), int(places.max()) + 1))
+        counts[profiles, places] = sizes
+        return counts
+
+    def pool_repeats(self, values: np.ndarray) -> tuple[int, float]:
+        """Return degrees of freedom and sum of squares of values (N,) about their means in the bins."""
+        starts, counts, _, _ = self._places
+        means = np.repeat(np.add.reduceat(values, starts) / counts, counts)
+        return len(values) - len(starts), float(np.sum((values - means) ** 2))
+
+
+@dataclass(frozen=True, eq=False)
 class Problem(GroupedEvidence[MountState]):
     """Points (n, 3) of every pose in the sensor's frame, mm, and the choice of unknowns.
 
@@ -180,20 +218,8 @@ class Problem(GroupedEvidence[MountState]):
 
     def select_detected(self, seen: Sequence[Detection | None]) -> "Problem":
         """Return the problem of the points on the artefact; poses with None are removed."""
-        points = [own if each is None else own[each.members] for own, each in zip(self.points, seen, strict=True)]
+        points = [one if each is None else one[each.members] for one, each in zip(self.points, seen, strict=True)]
         return self.select(np.array([each is not None for each in seen]), points)
-
-    def detect_again(
-        self, state: MountState, flat: Sequence[np.ndarray], reach_mm: float, rng: np.random.Generator
-    ) -> list[Detection | None]:
-        """Find the artefact again in the profiles (N, 2) of all poses, near its place in a state; else None."""
-        found: list[Detection | None] = []
-        for points, off in zip(flat, np.split(self.distances(state), np.cumsum(self.counts)[:-1]), strict=True):
-            near = np.abs(off) < reach_mm
-            seen = self.shape.find(points[near], rng)
-            seen = seen and seen.expand(near).without_isolated(points)
-            found.append(seen if seen is not None and seen.members.sum() >= LEAST_POINTS else None)
-        return found
 
     def apply_step(self, state: MountState, step: np.ndarray) -> MountState:
         step = self.free @ step
@@ -228,7 +254,7 @@ class Problem(GroupedEvidence[MountState]):
         normals = self.shape.normals(state.artefact, self.to_base(state))
         if not self.shape.flat:
             return normals
-        middles = np.repeat([own.mean(axis=0) for own in self.points], self.counts, axis=0)
+        middles = np.repeat([profile.mean(axis=0) for profile in self.points], self.counts, axis=0)
         arms = np.einsum("nij,nj->ni", self.motion(state.offset_s)[0][self.poses] @ state.rotation, self._all - middles)
         return self.project_on_lines(np.hstack([normals, np.cross(arms, normals)]))
 
@@ -262,8 +288,8 @@ class Problem(GroupedEvidence[MountState]):
     def _lines(self) -> list[np.ndarray]:
         """Orthonormal bases (n, 2) of the noise-free changes of each profile of a flat artefact."""
         bases = []
-        for own in self.points:
-            centred = own - own.mean(axis=0)
+        for profile in self.points:
+            centred = profile - profile.mean(axis=0)
             along = centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
             bases.append(np.linalg.qr(np.column_stack([np.ones(len(along)), along]))[0])
         return bases
@@ -277,7 +303,7 @@ class Problem(GroupedEvidence[MountState]):
             return values
         ends = np.cumsum(self.counts)[:-1]
         parts = zip(self._lines, np.split(values, ends), strict=True)
-        return np.concatenate([basis @ (basis.T @ own) for basis, own in parts])
+        return np.concatenate([basis @ (basis.T @ part) for basis, part in parts])
 
     def noise_along(self, state: MountState) -> np.ndarray:
         """Return the fraction (N, 1) of the points' noise (in the sheet) that changes their distances.
@@ -291,35 +317,21 @@ class Problem(GroupedEvidence[MountState]):
         return np.sqrt(np.maximum(1 - out_of_sheet**2, _LEAST_SHARE**2))[:, None]
 
     @cached_property
-    def _bins(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """First point (B,) of each bin, its number of points, its pose, and its number in the profile."""
-        bins = np.minimum(_BINS, self.counts)
-        poses, places = np.repeat(np.arange(len(bins)), bins), np.concatenate([np.arange(count) for count in bins])
-        first = (np.cumsum(self.counts) - self.counts)[poses] + (places * (self.counts / bins)[poses]).astype(int)
-        return first, np.diff(first, append=len(self._all)), poses, places
-
-    def bin_means(self, values: np.ndarray) -> np.ndarray:
-        """Return means (P, K, ...) of values (N, ...) in bins along the profiles, padded with 0."""
-        starts, counts, poses, places = self._bins
-        result = np.zeros((len(self.points), int(places.max()) + 1, *values.shape[1:]))
-        result[poses, places] = np.add.reduceat(values, starts, axis=0) / counts.reshape(-1, *[1] * (values.ndim - 1))
-        return result
+    def _bins(self) -> ProfileBins:
+        return ProfileBins(self.counts)
 
     @cached_property
-    def _apart(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Masks (P, K) of the bins with points, their numbers of points (P, K), and distances (P, K, K) of bins, mm."""
-        _, sizes, poses, places = self._bins
-        middles = self.bin_means(self._all)
-        counts = np.zeros(middles.shape[:2])
-        counts[poses, places] = sizes
-        return counts > 0, counts, np.linalg.norm(middles[:, :, None] - middles[:, None], axis=3)
+    def _apart(self) -> np.ndarray:
+        """Distances (P, K, K) between the bins of each profile, mm."""
+        middles = self._bins.means(self._all)
+        return np.linalg.norm(middles[:, :, None] - middles[:, None], axis=3)
 
     def bounds(self) -> np.ndarray:
         """Return bounds (5, 2) of `Scatter`."""
-        there, _, apart = self._apart
+        there, far = self._bins.counts > 0, self._apart
         both = (there[:, :, None] & there[:, None])[:, 1:, :-1]
-        beside = float(np.median(np.diagonal(apart[:, 1:, :-1], axis1=1, axis2=2)[np.diagonal(both, axis1=1, axis2=2)]))
-        longest = max(float(np.max(apart[:, 1:, :-1][both])), 2 * beside)
+        beside = float(np.median(np.diagonal(far[:, 1:, :-1], axis1=1, axis2=2)[np.diagonal(both, axis1=1, axis2=2)]))
+        longest = max(float(np.max(far[:, 1:, :-1][both])), 2 * beside)
         turn = _TURN_RAD if self.shape.flat else (_TURN_RAD[0],) * 2
         return np.array([_POINT_MM, _POINT_MM, (beside / 2, longest), _POINT_MM, turn])
 
@@ -334,7 +346,7 @@ class Problem(GroupedEvidence[MountState]):
         if self.shape.flat:
             # Shifts change the profile of a sphere as all parameters do. Noise would make the columns differ.
             changes = np.hstack([changes, self.derivatives(state)])
-        means = self.bin_means(changes)
+        means = self._bins.means(changes)
         sizes = np.linalg.norm(means, axis=1, keepdims=True).clip(1e-30)
         basis, spans, _ = np.linalg.svd(means / sizes, full_matrices=False)
         used = spans > _LEAST_SPAN * spans[:, :1]
@@ -349,7 +361,7 @@ class Problem(GroupedEvidence[MountState]):
 
     def project(self, state: MountState, values: np.ndarray) -> np.ndarray:
         """Return the coordinates (P, q, ...) of changes (N, ...) of the distances, by unweighted least squares."""
-        means, across = self.bin_means(values), np.swapaxes(self.basis(state), 1, 2)
+        means, across = self._bins.means(values), np.swapaxes(self.basis(state), 1, 2)
         return across @ means if means.ndim == 3 else (across @ means[:, :, None])[:, :, 0]
 
     def residuals(self, state: MountState, step: np.ndarray | None = None) -> np.ndarray:
@@ -370,17 +382,17 @@ class Problem(GroupedEvidence[MountState]):
         return self.project(state, derivatives @ self.free)
 
     def covariance(self, state: MountState) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
-        _, counts, apart = self._apart
-        basis, share = self.basis(state), self.bin_means(self.noise_along(state))
+        counts, distances = self._bins.counts, self._apart
+        basis, share = self.basis(state), self._bins.means(self.noise_along(state))
         by_bins = np.swapaxes(share * basis, 1, 2)
         by_points = by_bins / np.sqrt(np.maximum(counts, 1))[:, None]
         errors = self.project(state, self.pose_error_derivatives(state))
-        noise, shifts, turns = (own @ np.swapaxes(own, 1, 2) for own in (by_points, errors[:, :, :3], errors[:, :, 3:]))
+        noise, shifts, turns = (one @ np.swapaxes(one, 1, 2) for one in (by_points, errors[:, :, :3], errors[:, :, 3:]))
         filled = np.eye(basis.shape[2]) * np.logical_not(basis.any(axis=1))[:, :, None]
 
         def covariances(logs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             scatter = Scatter(*np.exp(logs))
-            far = apart / scatter.length_mm
+            far = distances / scatter.length_mm
             falling = scatter.smooth_mm**2 * np.exp(-far)
             smooth, longer = (by_bins @ (falling * each) @ np.swapaxes(by_bins, 1, 2) for each in (1 + far, far**2))
             parts = [scatter.point_mm**2 * noise, smooth, scatter.pose_mm**2 * shifts, scatter.turn_rad**2 * turns]
@@ -394,10 +406,7 @@ class Problem(GroupedEvidence[MountState]):
 
     def pool_repeats(self, state: MountState) -> tuple[int, float]:
         """Return degrees of freedom and sum of squares of the points' noise within the bins."""
-        starts, counts, _, _ = self._bins
-        values = self.distances(state) / self.noise_along(state)[:, 0]
-        means = np.repeat(np.add.reduceat(values, starts) / counts, counts)
-        return len(values) - len(starts), float(np.sum((values - means) ** 2))
+        return self._bins.pool_repeats(self.distances(state) / self.noise_along(state)[:, 0])
 
     def pose_directions(self, state: MountState) -> list[np.ndarray]:
         return [np.eye(each.shape[1])[:, each.any(axis=0)] for each in self.basis(state)]
@@ -429,3 +438,16 @@ def _left_jacobian(vector: np.ndarray) -> np.ndarray:
     if angle < 1e-6:
         return np.eye(3) + cross / 2
     return np.eye(3) + (1 - np.cos(angle)) / angle**2 * cross + (angle - np.sin(angle)) / angle**3 * cross @ cross
+
+
+def detect_again(
+    problem: Problem, state: MountState, flat: Sequence[np.ndarray], reach_mm: float, rng: np.random.Generator
+) -> list[Detection | None]:
+    """Find the artefact again in the profiles (N, 2) of all poses, near its place in a state; else None."""
+    found: list[Detection | None] = []
+    for points, off in zip(flat, np.split(problem.distances(state), np.cumsum(problem.counts)[:-1]), strict=True):
+        near = np.abs(off) < reach_mm
+        seen = problem.shape.find(points[near], rng)
+        seen = seen and seen.expand(near).without_isolated(points)
+        found.append(seen if seen is not None and seen.members.sum() >= LEAST_POINTS else None)
+    return found

@@ -136,9 +136,9 @@ class RestrictedEstimate(Generic[State]):
         """Parameter step (a Gauss-Newton step) and covariance of the parameters without each group."""
         slopes = np.einsum("gkp,gk->gp", self._weighted, self.residuals)
         total, slope, found = self.information.sum(axis=0), slopes.sum(axis=0), []
-        for information, own in zip(self.information, slopes, strict=True):
+        for information, each in zip(self.information, slopes, strict=True):
             covariance = invert_information(total - information)
-            found.append((-covariance @ (slope - own), covariance))
+            found.append((-covariance @ (slope - each), covariance))
         return found
 
     def excess(self, *, probability: float) -> np.ndarray:

@@ -38,15 +38,11 @@ def start(
     if problem.shape.flat:
         return _start_of_plane(problem, [each for each in seen if isinstance(each, ProfileLine)], sheet, rng)
     return (
-        _start_of_sphere(problem, arcs, sheet, rng)
-        if towards is None
-        else _start_on_table(problem, arcs, sheet, towards)
+        _start_sphere(problem, arcs, sheet, rng) if towards is None else _start_on_table(problem, arcs, sheet, towards)
     )
 
 
-def _start_of_sphere(
-    problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray, rng: np.random.Generator
-) -> MountState:
+def _start_sphere(problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray, rng: np.random.Generator) -> MountState:
     """Estimate a state near the solution from the arcs in the profiles; ``sheet`` as in `start`.
 
     The centre of a circle of radius r in a profile is the sphere's centre without its coordinate across the sheet, y =
