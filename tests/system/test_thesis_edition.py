@@ -67,7 +67,7 @@ def edition(folder: Path) -> FigureTable:
     """Figures of the small campaign."""
     described = load_campaign("thesis").model_dump(include={"title"}) | SENSORS | {"recordings": RECORDINGS}
     wanted = {method for _, method, _ in GATES_MM}
-    how = {"name": "small", "methods": [each for each in THESIS_METHODS if each.name in wanted], "with_truth": True}
+    how = {"name": "small", "methods": [each for each in THESIS_METHODS if each.name in wanted]}
     return run_experiment(Campaign.model_validate(described), folder, range(1), RecordingOptions(EVERY), **how).table
 
 
@@ -136,7 +136,7 @@ def imperfect(tmp_path_factory: pytest.TempPathFactory) -> FigureTable:
     scans = {"scene": "spheres", "media": ["water"], "placements": places}
     plane = {"scene": "plane", "media": ["water"], "placements": ["standoff"]}
     campaign = Campaign.model_validate(described | {"recordings": [*RECORDINGS[:4], scans, plane]})
-    how = {"name": "imperfect", "methods": METHODS, "with_truth": True}
+    how = {"name": "imperfect", "methods": METHODS}
     out = tmp_path_factory.mktemp("imperfect")
     return run_experiment(campaign, out, range(1, 2), RecordingOptions(EVERY), **how).table
 

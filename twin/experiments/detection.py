@@ -180,7 +180,7 @@ def fit_signal_response(depth_mm: np.ndarray, signal_mm: np.ndarray, *, threshol
 _TIGHT = {"xatol": 1e-7, "fatol": 1e-9, "maxiter": 4000}
 
 
-def _second_differences(of: Callable[[np.ndarray], float], at: np.ndarray, steps: np.ndarray) -> np.ndarray:
+def _differentiate_twice(of: Callable[[np.ndarray], float], at: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """Return the second derivatives (K, K) of a function, with respect to parameters in units of ``steps`` (K,)."""
     moves = np.diag(steps) / 2
     return np.array([[of(at + a + b) - of(at + a - b) - of(at - a + b) + of(at - a - b) for b in moves] for a in moves])
@@ -272,17 +272,19 @@ def _collect_pits(into: FlawFindings, scene: Scene, inspection: dict[str, Any]) 
     known: dict[int, dict[str, Any] | None] = {}
     for feature in hollows:
         # Neighbours that the search joined are found, too, but their depths are not measured.
-        for own, at in [(feature, feature["place_mm"]), *((None, at) for at in feature["hollows_mm"])]:
-            away = np.linalg.norm(pits - on_surface(at), axis=1)
-            nearest = int(np.argmin(away))
-            if away[nearest] < reach + _PLACE_MM and known.get(nearest) is None:
-                known[nearest] = own
+        for whole, at in [(feature, feature["place_mm"]), *((None, at) for at in feature["hollows_mm"])]:
+            distance = np.linalg.norm(pits - on_surface(at), axis=1)
+            nearest = int(np.argmin(distance))
+            if distance[nearest] < reach + _PLACE_MM and known.get(nearest) is None:
+                known[nearest] = whole
     into.false_calls += sum(
         bool(np.all(np.linalg.norm(pits - on_surface(each["place_mm"]), axis=1) > reach + _PLACE_MM))
         for each in inspection["features"]
         if each["kind"] in ("pit", "dent", "protrusion")
     )
-    first, last = _scanned_mm(scene)
+    first, last = -math.inf, math.inf  # ends of the scan along X; without a stage, everything
+    if isinstance(move := scene.motion, Motion):
+        first, last = sorted((move.start_mm, move.start_mm + move.step_mm * (move.count - 1)))
     along = pits[:, 0] + place[0, 3]
     for pit in np.flatnonzero((along > first) & (along < last)).tolist():
         into.depths_mm.append(depths[pit])
@@ -311,14 +313,6 @@ def _collect_undercuts(into: FlawFindings, scene: Scene, inspection: dict[str, A
 def _value(value: dict[str, Any]) -> tuple[float, float]:
     """Return a value and its standard uncertainty."""
     return value["value"], math.hypot(value["random"], value["systematic"] or 0.0)
-
-
-def _scanned_mm(scene: Scene) -> tuple[float, float]:
-    """Return the ends of a scan along X; without a stage, everything."""
-    if not isinstance(scene.motion, Motion):
-        return -math.inf, math.inf
-    ends = scene.motion.start_mm, scene.motion.start_mm + scene.motion.step_mm * (scene.motion.count - 1)
-    return min(ends), max(ends)
 
 
 def deep_values(found: FlawFindings, detection: ProbabilityOfDetection) -> Iterator[tuple[float, float, float]]:

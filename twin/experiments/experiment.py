@@ -14,7 +14,7 @@ from twin.recording.campaigns import RecordingOptions, make_folder, record_campa
 from twin.rendering_options import CPU, Variant
 from twin.scene.campaign import Campaign, find_understated, list_takes, load_campaign
 from uwlts.errors import DescriptionError, DescriptionWarning
-from uwlts.files.writing import write_atomically
+from uwlts.files.writing import write_file
 from uwlts.model.library import validate_description
 from uwlts.model.sensor import Sensor
 from uwlts.runtime.progress import ProgressListener, ignore_progress
@@ -68,9 +68,7 @@ def experiment(
         Folder for campaigns and results (default: runs/experiment-SENSOR). Complete recordings in it are kept.
     scheduler
         Address of a Dask scheduler whose workers share the folder. Default: processes on this machine.
-    overwrite
-        Render everything again.
-    every, workers
+    every, workers, overwrite
         As for `record`.
     spp, variant
         As for `simulate`.
@@ -113,14 +111,15 @@ def experiment(
     ]
     scans = [each if isinstance(each, dict) else {"scene": str(each)} for each in scenes]
     changes: dict[str, Any] = {
-        "sensor": _name_of(sensor, folder / "sensor.toml"),
-        "as_built": _name_of(sensor if as_built is None else as_built, folder / "as-built.toml"),
+        "sensor": _store_sensor(sensor, folder / "sensor.toml"),
+        "as_built": _store_sensor(sensor if as_built is None else as_built, folder / "as-built.toml"),
         "recordings": [*(each.model_dump() for each in evidence), *scans],
     }
     changes |= {} if imperfections is None else {"imperfections": imperfections}
     changes |= {} if water is None else {"water": water}
     described = validate_description(Campaign, described.model_dump() | changes, str(campaign))
-    return run_experiment(described, folder, seeds, options, name=str(campaign), with_truth=True, progress=progress)
+    joint = choose_joint(described, every, with_truth=True)
+    return run_experiment(described, folder, seeds, options, name=str(campaign), methods=[joint], progress=progress)
 
 
 def predict(
@@ -160,9 +159,7 @@ def predict(
         Number of campaigns.
     first
         Seed of the first campaign; the others follow.
-    overwrite
-        Render everything again.
-    every, workers
+    every, workers, overwrite
         As for `record`.
     spp, variant
         As for `simulate`.
@@ -194,7 +191,8 @@ def predict(
     described = validate_description(Campaign, described.model_dump() | changes, str(campaign))
     folder = Path(out or Path("runs") / f"predict-{Path(described.sensor).stem}")
     seeds = range(first, first + campaigns)
-    return run_experiment(described, folder, seeds, options, name=str(campaign), with_truth=False, progress=progress)
+    joint = choose_joint(described, every, with_truth=False)
+    return run_experiment(described, folder, seeds, options, name=str(campaign), methods=[joint], progress=progress)
 
 
 def run_experiment(
@@ -204,22 +202,17 @@ def run_experiment(
     options: RecordingOptions,
     *,
     name: str,
-    with_truth: bool,
-    methods: Sequence[Method] = (),
+    methods: Sequence[Method],
     published: str | Path | None = None,
     progress: ProgressListener = ignore_progress,
 ) -> ExperimentResult:
     """Record a campaign for each seed, calibrate it, measure its scans, and write table and page.
 
-    ``methods`` are the calibrations, whose scans count if the campaign has them; by default the joint one with all
-    recordings of targets and steps. ``with_truth`` compares all scans with the ground truth, so that scans of any scene
-    count; otherwise those of an artefact, a pitted pipe or a weld. ``published`` are tables to compare with, by name or
-    path. Raises as `experiment`.
+    ``methods`` are the calibrations, whose scans count if the campaign has them. ``published`` are tables to compare
+    with, by name or path. Raises as `experiment`.
     """
-    every = options.every
     require_at_least(0, seed=min(seeds))
-    methods = methods or [choose_joint(campaign, every, all_scans=with_truth)]
-    takes = [{take.name: take for take in list_takes(campaign, seed=seed, every=every)} for seed in seeds]
+    takes = [{take.name: take for take in list_takes(campaign, seed=seed, every=options.every)} for seed in seeds]
     methods = [each for method in methods if (each := method.restrict_to(takes[0])).scans]
     if not methods:
         raise DescriptionError(f"campaign {campaign.title!r} has none of the scans that the calibrations measure")
@@ -232,10 +225,9 @@ def run_experiment(
     lines = [
         line
         for place, of_seed in by_folder.items()
-        for line in plan_lines(place, of_seed, methods, with_truth=with_truth, coloured=place == folders[0])
+        for line in plan_lines(place, of_seed, methods, coloured=place == folders[0])
     ]
-    with write_atomically(folder / "commands.sh", overwrite=True) as aside:
-        aside.write_text("".join(f"{line.text}\n" for line in lines), encoding="utf-8")
+    write_file(folder / "commands.sh", "".join(f"{line.text}\n" for line in lines), overwrite=True)
     run_stages(lines, scheduler=options.scheduler, progress=progress)
     rows = [row for place, of_seed in by_folder.items() for row in read_figures(place, of_seed, methods)]
     detections, depths = read_flaws(by_folder, methods[0])
@@ -258,30 +250,30 @@ def run_experiment(
     return result
 
 
-def choose_joint(campaign: Campaign, every: int, *, all_scans: bool) -> Method:
-    """Return the joint calibration of a campaign and its scans.
+def choose_joint(campaign: Campaign, every: int, *, with_truth: bool) -> Method:
+    """Return the joint calibration with all recordings of targets and steps of a campaign, and its scans.
 
-    Raises DescriptionError if there is no recording of a target, or no scan.
+    Without ``with_truth``, scans are those of an artefact, a pitted pipe or a weld. Raises DescriptionError if there is
+    no recording of a target, or no scan.
     """
     evidence: dict[str, list[str]] = {"air": [], "water": [], "step": []}
     scans: list[str] = []
     for take in list_takes(campaign, seed=0, every=every):
         if (option := evidence_of(take)) is not None:
             evidence[option].append(take.name)
-        elif all_scans or is_evaluated(take.scene) or inspected_as(take.scene) is not None:
+        elif with_truth or is_evaluated(take.scene) or inspected_as(take.scene) is not None:
             scans.append(take.name)
     if not evidence["air"] and not evidence["water"]:
         raise DescriptionError(f"campaign {campaign.title!r} has no recording of a target for the calibration")
     if not scans:
         raise DescriptionError(f"campaign {campaign.title!r} has no scan of an artefact, a pitted pipe or a weld")
-    return Method(JOINT, evidence, scans)
+    return Method(JOINT, evidence, scans, with_truth=with_truth)
 
 
-def _name_of(sensor: str | Path | Sensor, path: Path) -> str:
+def _store_sensor(sensor: str | Path | Sensor, path: Path) -> str:
     """Return name or path of a sensor; a description is written to ``path``."""
     if not isinstance(sensor, Sensor):
         return str(sensor)
     make_folder(path.parent)
-    with write_atomically(path, overwrite=True) as aside:
-        aside.write_text(tomli_w.dumps(sensor.model_dump(mode="json", exclude_none=True)), encoding="utf-8")
+    write_file(path, tomli_w.dumps(sensor.model_dump(mode="json", exclude_none=True)), overwrite=True)
     return str(path)

@@ -172,14 +172,14 @@ def describe_conditions(take: Take) -> str:
     scene, medium = take.scene, medium_of(take.sensor, take.scene)
     z = scene.placements[scene.placement].position_mm[2]
     place = "at the stand-off" if z == 0 else f"{abs(z):g} mm {'behind' if z > 0 else 'before'} the stand-off"
-    apart = f" {scene.motion.step_mm:g} mm apart" if isinstance(scene.motion, Motion) else ""
+    spacing = f" {scene.motion.step_mm:g} mm apart" if isinstance(scene.motion, Motion) else ""
     wavelength = take.sensor.laser.wavelength_nm
     water = (
         f", {scene.medium} with a = {1e3 * medium.absorption_per_mm(wavelength):.2g}/m "
         f"and b = {1e3 * medium.scattering_per_mm(wavelength):.2g}/m"
     )
     return (
-        f"{scene.title}, {place}, {scene.motion.images()} profiles{apart}{water if medium.kind != 'air' else ', air'}"
+        f"{scene.title}, {place}, {scene.motion.images()} profiles{spacing}{water if medium.kind != 'air' else ', air'}"
     )
 
 

@@ -127,9 +127,7 @@ def reproduce(
         Compare the joint calibration with both methods of the thesis on the same images, instead.
     out
         Folder for campaigns and results (default: runs/CAMPAIGN). Complete recordings in it are kept.
-    overwrite
-        Render everything again.
-    campaigns, first, every, workers
+    campaigns, first, every, workers, overwrite
         As for `predict`.
     spp, variant
         As for `simulate`.
@@ -151,7 +149,7 @@ def reproduce(
     require_at_least(0, first=first)
     campaign = campaign or ("joint" if joint else "thesis")
     folder = Path(out or Path("runs") / Path(campaign).stem)
-    how = {"name": str(campaign), "with_truth": True, "progress": progress}
+    how = {"name": str(campaign), "progress": progress}
     how |= {"methods": METHODS} if joint else {"methods": THESIS_METHODS, "published": "thesis-tables"}
     seeds = range(first, first + campaigns)
     result = run_experiment(load_campaign(campaign), folder, seeds, options, **how)
@@ -213,7 +211,7 @@ def demo(out: str | Path = "runs/demo", *, progress: ProgressListener = ignore_p
     DescriptionError, OutputError, SetupError
         As for `experiment`.
     """
-    how = {"name": "demo", "methods": DEMO_METHODS, "with_truth": True, "progress": progress}
+    how = {"name": "demo", "methods": DEMO_METHODS, "progress": progress}
     result = run_experiment(load_campaign("demo"), Path(out), [0], RecordingOptions(), **how)
     print("\n".join(result.lines()))
     return Path(out) / PAGE

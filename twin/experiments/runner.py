@@ -40,7 +40,8 @@ class Method:
     ``evidence`` are names of recordings by option of `uwlts calibrate`, or of another ``command``; ``options`` its
     other options. ``suffix`` ends the names of files, so that several methods can share a folder, ``made`` that of the
     calibration if it is another method's. ``detection`` are options of `uwlts reconstruct`. Objects are inspected
-    unless ``inspected`` is False. ``thesis`` are names of recordings by option of `uwlts thesis`.
+    unless ``inspected`` is False. ``with_truth`` compares all scans with the ground truth of their recordings, so that
+    scans of any scene count. ``thesis`` are names of recordings by option of `uwlts thesis`.
     """
 
     name: str
@@ -52,6 +53,7 @@ class Method:
     made: str | None = None
     detection: str = ""
     inspected: bool = True
+    with_truth: bool = True
     thesis: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     def calibration(self, folder: Path) -> Path:
@@ -116,18 +118,17 @@ def is_evaluated(scene: Scene) -> bool:
 
 
 def plan_lines(
-    folder: Path, takes: Mapping[str, Take], methods: Sequence[Method], *, with_truth: bool, coloured: bool = False
+    folder: Path, takes: Mapping[str, Take], methods: Sequence[Method], *, coloured: bool = False
 ) -> list[CommandLine]:
     """Return the command lines that calibrate, reconstruct and measure in a campaign's folder, by stage.
 
-    ``with_truth`` compares all clouds with the ground truth of their recordings, too. With ``coloured``, those of the
-    first method are also written with the colours of their deviations.
+    With ``coloured``, clouds of the first method are also written with the colours of their deviations.
     """
     lines: dict[Path, CommandLine] = {}
     for method in methods:
         made = method.calibration(folder)
-        words = (*_give(folder, method.evidence), *shlex.split(method.options), "--out", made)
-        lines[made] = _line("calibrate", made, method.command, *words)
+        arguments = (*_give(folder, method.evidence), *shlex.split(method.options), "--out", made)
+        lines[made] = _line("calibrate", made, method.command, *arguments)
     for method in methods:
         calibration = method.calibration(folder)
         if any(method.thesis.values()):
@@ -135,12 +136,12 @@ def plan_lines(
             lines[made] = _line("evaluate", made, "thesis", calibration, *_give(folder, method.thesis), "--out", made)
         for scan in method.scans:
             capture, cloud = folder / f"{scan}.h5", method.result(folder, scan, "cloud.h5")
-            words = (capture, "--calibration", calibration, "--out", cloud, *shlex.split(method.detection))
-            lines[cloud] = _line("reconstruct", cloud, "reconstruct", *words)
-            if with_truth or is_evaluated(takes[scan].scene):
+            arguments = (capture, "--calibration", calibration, "--out", cloud, *shlex.split(method.detection))
+            lines[cloud] = _line("reconstruct", cloud, "reconstruct", *arguments)
+            if method.with_truth or is_evaluated(takes[scan].scene):
                 made = method.result(folder, scan, "evaluation.json")
-                compared = ["--truth", str(capture.with_suffix(".truth.h5"))] if with_truth else []
-                if with_truth and coloured and method is methods[0]:
+                compared = ["--truth", str(capture.with_suffix(".truth.h5"))] if method.with_truth else []
+                if method.with_truth and coloured and method is methods[0]:
                     compared += ["--coloured", str(method.result(folder, scan, COLOURED))]
                 lines[made] = _line("evaluate", made, "evaluate", cloud, "--out", made, *compared)
             if method.inspected and (kind := inspected_as(takes[scan].scene)) is not None:
@@ -213,6 +214,6 @@ def run_apart(line: str) -> tuple[int, str]:
 
     Several threads of a process can do so at the same time.
     """
-    words = [sys.executable, "-m", *shlex.split(line)]
-    done = subprocess.run(words, check=False, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    arguments = [sys.executable, "-m", *shlex.split(line)]
+    done = subprocess.run(arguments, check=False, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     return done.returncode, done.stdout
