@@ -25,7 +25,7 @@ import uwlts
 from docs.studies.result_tables import ROOT, publish, table
 from uwlts.calibration.camera.camera_parameters import TargetImage
 from uwlts.calibration.camera.lens import LensChoice, calibrate_lens
-from uwlts.calibration.guidance.pose_advice import estimate_pose
+from uwlts.calibration.guidance import estimate_pose
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, CalibrationResult, gather, solve
 from uwlts.calibration.sequential.sheet_fit import points_on_target
 from uwlts.fitting.least_squares import MAD_TO_STD

@@ -25,7 +25,7 @@ from uwlts.fitting.least_squares import noise_factor
 from uwlts.model.sensor import Table
 from uwlts.model.short_text import Brief
 from uwlts.model.trajectory import Trajectory, convert_to_platform_clock
-from uwlts.reconstruction.path_uncertainty import correct_path_uncertainty
+from uwlts.reconstruction.moving import correct_path_uncertainty
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import load_cloud

@@ -122,13 +122,13 @@ def _select_walk(estimate: PathEstimate) -> PathEstimate:
 
 def _search_range(estimate: PathEstimate, pair: Pair) -> np.ndarray | None:
     """Return the search range (3,) of the later piece; None if it cannot reach the earlier one."""
-    other, own = (estimate.surface(number).places_mm for number in pair)
-    low, high = own.min(axis=0), own.max(axis=0)
+    other, surface = (estimate.surface(number).places_mm for number in pair)
+    low, high = surface.min(axis=0), surface.max(axis=0)
     std = np.sqrt(np.diag(estimate.relative_covariance(pair, (low + high) / 2)))
     turned = float(np.linalg.norm(high - low)) / 2 * std[3:].max()
     reach = estimate.options.search_sigmas * (std[:3] + turned)
-    apart = np.maximum(low - reach - other.max(axis=0), other.min(axis=0) - high - reach)
-    return None if (apart > 0).any() else reach
+    separation = np.maximum(low - reach - other.max(axis=0), other.min(axis=0) - high - reach)
+    return None if (separation > 0).any() else reach
 
 
 def _find_hypotheses(estimate: PathEstimate, pair: Pair, reach: np.ndarray) -> list[Hypothesis]:
@@ -136,7 +136,7 @@ def _find_hypotheses(estimate: PathEstimate, pair: Pair, reach: np.ndarray) -> l
 
     The height maps of both, including their neighbours on the path, are correlated for all shifts.
     """
-    other, own = (estimate.surface(number) for number in pair)
+    other, surface = (estimate.surface(number) for number in pair)
     normal = np.linalg.eigh(other.normals.T @ other.normals)[1][:, 2]
     frame = np.stack([*perpendicular_to(normal), normal])
     near = [range(max(0, k - 1), min(len(estimate.pieces), k + 2)) for k in pair[::-1]]
@@ -144,17 +144,17 @@ def _find_hypotheses(estimate: PathEstimate, pair: Pair, reach: np.ndarray) -> l
     options, drift, part = estimate.options, estimate.prior.drift, 1 / len(estimate.pieces)
     # Deformation of a piece by the unknown drift, through its constant rate and its random walk.
     bent = float(np.max(drift.std[:3] * np.sqrt(part**2 + drift.walk[:3] * part)))
-    middle = own.places_mm.mean(axis=0)
+    middle = surface.places_mm.mean(axis=0)
     # The accuracy of a pose is limited by the deformation of both pieces and by the patch radius.
-    std = max(bent, own.radius_mm) * np.repeat([1.0, 1 / rms_distance(own.places_mm, middle)], 3)
+    std = max(bent, surface.radius_mm) * np.repeat([1.0, 1 / rms_distance(surface.places_mm, middle)], 3)
     found = []
     for shift in correlate_heights(
-        clouds[0], clouds[1], options, pixel_mm=options.pixel * own.radius_mm, reach_mm=np.abs(frame) @ reach
+        clouds[0], clouds[1], options, pixel_mm=options.pixel * surface.radius_mm, reach_mm=np.abs(frame) @ reach
     ):
-        if (refined := fit_pair(own, other, rigid_transform(np.eye(3), shift @ frame))) is None:
+        if (refined := fit_pair(surface, other, rigid_transform(np.eye(3), shift @ frame))) is None:
             continue
-        pose, apart = refined
-        fits = np.abs(apart.distance_mm) < np.maximum(options.agreeing_sigmas * apart.std_mm, bent)
+        pose, separation = refined
+        fits = np.abs(separation.distance_mm) < np.maximum(options.agreeing_sigmas * separation.std_mm, bent)
         if np.count_nonzero(fits) >= options.fewest_patches and np.mean(fits) >= options.least_lying:
             turn = Rotation.from_matrix(pose[:3, :3])
             moved = np.append(turn.apply(middle) + pose[:3, 3] - middle, turn.as_rotvec())
@@ -182,8 +182,8 @@ def _has_rival(before: PathEstimate, closed: PathEstimate, best: Hypothesis, bes
         other = accept_hypothesis(before, rival)
         if other is not None:
             # An inaccurate rival pose may converge to the same position.
-            apart = (each.relative_movement(best.pair, best.at_mm) @ each.values for each in (other, closed))
-            if np.linalg.norm(np.subtract(*apart)[:3]) > before.reach_mm:
+            difference = (each.relative_movement(best.pair, best.at_mm) @ each.values for each in (other, closed))
+            if np.linalg.norm(np.subtract(*difference)[:3]) > before.reach_mm:
                 return True
     return False
 
@@ -230,8 +230,8 @@ def correlate_heights(
     outside = [np.abs(each * pixel_mm) > reach + pixel_mm for each, reach in zip(steps, reach_mm[:2], strict=True)]
     score[outside[0][:, None] | outside[1]] = -np.inf
     # The width of a peak is that of the compared structures.
-    apart = 1 + 2 * int(options.coarsest_px / 4)
-    peaks = np.argwhere((score == maximum_filter(score, apart, mode="wrap")) & np.isfinite(score))
+    spacing = 1 + 2 * int(options.coarsest_px / 4)
+    peaks = np.argwhere((score == maximum_filter(score, spacing, mode="wrap")) & np.isfinite(score))
     order = np.argsort(-score[tuple(peaks.T)])[: options.proposals]
     along = (correlated(of_height[1], of_mask[0]) - correlated(of_mask[1], of_height[0])) / count
     found = [np.array([steps[0][i] * pixel_mm, steps[1][j] * pixel_mm, along[i, j]]) for i, j in peaks[order]]

@@ -202,10 +202,10 @@ class PathPrior:
                 break
             step_s *= 2
         # Drop regular nodes between dense ones, which would create short intervals.
-        apart = np.min(np.abs(self.nodes_s[:, None] - closer), axis=1, initial=np.inf) > step_s
-        apart[[0, -1]] = True
+        separate = np.min(np.abs(self.nodes_s[:, None] - closer), axis=1, initial=np.inf) > step_s
+        separate[[0, -1]] = True
         inner = closer[(closer > first + step_s / 2) & (closer < last - step_s / 2)]
-        nodes = np.union1d(self.nodes_s[apart], inner)
+        nodes = np.union1d(self.nodes_s[separate], inner)
         return replace(self, nodes_s=nodes, order=np.argsort(~np.isin(nodes, inner), kind="stable"))
 
     @property

@@ -301,10 +301,10 @@ def select_drift(estimate: PathEstimate, *, walk_only: bool = False) -> PathEsti
         return float(-np.sum(off**2) - 2 * np.sum(np.log(np.diag(factor))))
 
     described = (drift.correlation, drift.smooth, drift.walk[0])
-    own = best = [(each.correlation, each.smooth, each.walk[0]) for each in models].index(described)
+    first = best = [(each.correlation, each.smooth, each.walk[0]) for each in models].index(described)
     while (better := max(candidates_beside(best, walk_only=walk_only), key=twice_log_likelihood)) != best:
         best = better
-    return estimate if best == own else refine_nodes(with_drift(estimate, models[best]))
+    return estimate if best == first else refine_nodes(with_drift(estimate, models[best]))
 
 
 def with_drift(estimate: PathEstimate, drift: DriftModel) -> PathEstimate:
@@ -364,7 +364,7 @@ def _linearise_pair(estimate: PathEstimate, pair: Pair) -> Iterator[tuple[csr_ar
         return
     middle = np.vstack([used.places_mm for _, _, used, _ in ways]).mean(axis=0)
     twists = [rigid_derivatives(used.places_mm, used.normals, middle) for _, _, used, _ in ways]
-    observable = _observable_projection([(*way[2:], twist) for way, twist in zip(ways, twists, strict=True)], middle)
+    observable = _project_observable([(*way[2:], twist) for way, twist in zip(ways, twists, strict=True)], middle)
     component, half_s = estimate.prior.count * np.arange(6), estimate.half_s
     for (source, target, used, weight), twist in zip(ways, twists, strict=True):
         seen, columns, values = twist @ observable, [], []
@@ -388,7 +388,7 @@ def _linearise_pair(estimate: PathEstimate, pair: Pair) -> Iterator[tuple[csr_ar
         yield csr_array(places, shape=(len(weight), len(estimate.values))), weight, used.distance_mm
 
 
-def _observable_projection(ways: list[tuple[PatchDistances, np.ndarray, np.ndarray]], middle: np.ndarray) -> np.ndarray:
+def _project_observable(ways: list[tuple[PatchDistances, np.ndarray, np.ndarray]], middle: np.ndarray) -> np.ndarray:
     """Return the projection (6, 6) of a motion onto the part that the surfaces determine.
 
     ``ways`` are distances, their weights (Q,), and their derivatives (Q, 6) by translation and rotation about

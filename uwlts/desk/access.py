@@ -69,14 +69,14 @@ class PageAccess:
         hosts, origins = headers.getlist("Host"), headers.getlist("Origin")
         if len(hosts) != 1 or not self._is_own(hosts[0]):
             return f"this page is not at {', '.join(hosts) or 'an address without Host'}: open the address it printed"
-        own, foreign = [hosts[0].lower()], {"cross-site", "same-site"}
+        hosts_here, foreign = [hosts[0].lower()], {"cross-site", "same-site"}
         if page_port is not None:
-            name = _HOST.sub(r"\1", own[0])
+            name = _HOST.sub(r"\1", hosts_here[0])
             # Browsers omit port 80, and treat another port of the same machine as the same site.
-            own, foreign = [f"{name}:{page_port}", *[name] * (page_port == 80)], {"cross-site"}
+            hosts_here, foreign = [f"{name}:{page_port}", *[name] * (page_port == 80)], {"cross-site"}
         for origin in origins:
             parts = urlsplit(origin)
-            if parts.scheme not in ("http", "https") or parts.netloc.lower() not in own:
+            if parts.scheme not in ("http", "https") or parts.netloc.lower() not in hosts_here:
                 return f"requests of other sites ({origin}) are refused"
         sites, modes = headers.getlist("Sec-Fetch-Site"), headers.getlist("Sec-Fetch-Mode")
         return "requests of other sites are refused" if foreign & set(sites) and modes != ["navigate"] else None
@@ -94,8 +94,8 @@ class PageAccess:
             return False
         if bound is not None and bound.is_unspecified:
             # After DNS rebinding the Host is still the attacker's name, never an IP address.
-            own = socket.gethostname().lower()
-            return _address(name) is not None or name in (own, f"{own}.local")
+            machine = socket.gethostname().lower()
+            return _address(name) is not None or name in (machine, f"{machine}.local")
         return name == self.host.lower() or (bound is not None and _address(name) == bound)
 
     def is_operator(self, headers: Headers) -> bool:
@@ -149,8 +149,8 @@ class GuardedApp:
             if message["type"] == "http.response.start":
                 given = [*message["headers"], *_PROTECTION]
                 # A report has a stricter policy of its own.
-                own = any(name == b"content-security-policy" for name, _ in given)
-                message["headers"] = given if own else [*given, (b"content-security-policy", policy.encode())]
+                has_policy = any(name == b"content-security-policy" for name, _ in given)
+                message["headers"] = given if has_policy else [*given, (b"content-security-policy", policy.encode())]
             await send(message)
 
         host = _HOST.fullmatch(Headers(scope=scope).get("Host", ""))

@@ -245,11 +245,11 @@ def list_fields(kind: str) -> list[AnalysisField]:
         taken, described = getattr(package, function), descriptions(package, function)
         hints, parameters = get_type_hints(taken), inspect.signature(taken).parameters
         for name in names:
-            words = _LABELS.get(name, name.removesuffix("_mm").replace("_", " "))
+            text = _LABELS.get(name, name.removesuffix("_mm").replace("_", " "))
             fields.append(
                 AnalysisField(
                     name,
-                    f"{words}, mm" if name.endswith("_mm") else words,
+                    f"{text}, mm" if name.endswith("_mm") else text,
                     described[name].replace("`", ""),
                     parameters[name].default is inspect.Parameter.empty,
                     file_kind=_FILES.get(name, ""),
@@ -403,9 +403,9 @@ class Analyses:
             for each in targets:
                 refuse_unsuitable(each, overwrite=overwrite)
             with TemporaryDirectory(prefix=".", dir=self._folder) as aside:
-                own = replace(job, out=Path(aside) / job.out)
+                moved = replace(job, out=Path(aside) / job.out)
                 # With more than one worker, also a single job runs in a process of its own.
-                (outcome,) = run_jobs(_carry_out, [own], workers=2, on_message=hear, on_wait=look)
+                (outcome,) = run_jobs(_carry_out, [moved], workers=2, on_message=hear, on_wait=look)
                 for each in targets:
                     if each.exists() and not overwrite:
                         raise OutputError(f"{each.name} has appeared meanwhile: give another name")

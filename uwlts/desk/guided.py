@@ -18,8 +18,7 @@ from nicegui import ui
 
 from uwlts.calibration.camera.camera_parameters import CameraOptions
 from uwlts.calibration.camera.target_poses import Poses
-from uwlts.calibration.guidance.pose_advice import Setting, State
-from uwlts.calibration.guidance.step import PLACES, next_depth_mm, select_separate_depths
+from uwlts.calibration.guidance import PLACES, Setting, State, next_depth_mm, select_separate_depths
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, calibrate_sequentially
 from uwlts.desk.board_page import BoardView, update_regularly
 from uwlts.desk.guided_phases import Session, StepPhase, TargetPhase, list_missing

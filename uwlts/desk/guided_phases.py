@@ -24,31 +24,29 @@ from uwlts.calibration.camera.image_quality import (
     judge_target,
     measure_shift_px,
 )
-from uwlts.calibration.guidance.pose_advice import (
-    PoseAdvice,
+from uwlts.calibration.guidance import (
     RecordedPose,
     Setting,
     State,
+    StepQuality,
     best_pose,
     compute_gain,
     describe_missing,
     describe_missing_sheet,
     estimate_pose,
     format_pose_advice,
-    judge_residual,
-    solve_state,
-)
-from uwlts.calibration.guidance.step import (
-    StepQuality,
     is_separate_depth,
+    judge_residual,
     judge_step,
     least_separation_mm,
     next_depth_mm,
+    solve_state,
 )
 from uwlts.desk.guided_plan import GuidedPlan, GuidedStep
 from uwlts.desk.guided_screen import BoardScreen
 from uwlts.desk.shown_state import Picture
 from uwlts.errors import CalibrationError, TargetError
+from uwlts.fitting.next_observation import Forecast
 from uwlts.hardware.rig import START_MS, Rig
 from uwlts.hardware.scan_plan import Light, RigPlan
 from uwlts.model.calibration import Calibration, WindowModel
@@ -273,7 +271,7 @@ class TargetPhase:
         return state
 
     def _free(self, state: State) -> State:
-        advice: PoseAdvice | None = None
+        advice: Forecast | None = None
         refused: list[TargetView] = []
         still: TargetView | None = None
         since_s, skipped = time.monotonic(), 0
@@ -289,7 +287,7 @@ class TargetPhase:
             if found.view is None or still is None or measure_shift_px(still, found.view) > _STILL_PX:
                 still, since_s = found.view, time.monotonic()
             self._improve_light(found.reasons)
-            reasons = self._why_wait(found, state, advice, [*(p.view for p in state.recorded), *refused])
+            reasons = self._find_reasons(found, state, advice, [*(p.view for p in state.recorded), *refused])
             self._lead(found, state, advice, reasons)
             stands = still is not None and time.monotonic() - since_s >= self._plan.still_s
             if answer is None and (reasons or not stands):
@@ -304,8 +302,8 @@ class TargetPhase:
                 refused = [] if found.view is None else [found.view]
         return state
 
-    def _why_wait(
-        self, found: Found, state: State, advice: PoseAdvice | None, known: list[TargetView]
+    def _find_reasons(
+        self, found: Found, state: State, advice: Forecast | None, known: list[TargetView]
     ) -> tuple[str, ...]:
         """Return the reasons not to record the target as it is."""
         view = found.usable
@@ -317,7 +315,7 @@ class TargetPhase:
         gain = compute_gain(state, view, estimate_pose(view, state.camera))
         return () if gain >= _USEFUL * advice.gain else ("adds little to what there is",)
 
-    def _lead(self, found: Found, state: State, advice: PoseAdvice | None, reasons: tuple[str, ...]) -> None:
+    def _lead(self, found: Found, state: State, advice: Forecast | None, reasons: tuple[str, ...]) -> None:
         """Show the image and the next request to the operator."""
         pose = None if found.usable is None else estimate_pose(found.usable, state.camera)
         sheet = describe_missing_sheet(state)

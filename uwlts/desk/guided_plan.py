@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from uwlts.calibration.camera.target_poses import Poses
-from uwlts.calibration.guidance.pose_advice import CompletionLimits, RecordedPose, Setting, remove_window
+from uwlts.calibration.guidance import CompletionLimits, RecordedPose, Setting, remove_window
 from uwlts.errors import DescriptionError
 from uwlts.hardware.scan_plan import Direction, RigPlan, StageSettings, Table, read_plan_table
 from uwlts.model.artefacts import StepStandard
@@ -36,7 +36,7 @@ class GuidedStage(StageSettings):
     home: bool = False
 
     @model_validator(mode="after")
-    def _exclusive_positions(self) -> "GuidedStage":
+    def _check_exclusive(self) -> "GuidedStage":
         ends = self.first_mm is not None, self.last_mm is not None
         if any(ends) != all(ends) or (self.positions_mm and any(ends)):
             raise ValueError("give either positions_mm, or first_mm and last_mm with count")
@@ -79,7 +79,7 @@ class GuidedPlan(RigPlan):
     still_s: NotNegative = 0.8
 
     @model_validator(mode="after")
-    def _positions_for_poses(self) -> "GuidedPlan":
+    def _check_positions(self) -> "GuidedPlan":
         if self.poses != "free" and (self.stage is None or len(self.stage.places_mm()) < 2):
             raise ValueError(
                 f"poses '{self.poses}' need a [stage] with two positions or more: positions_mm, or first_mm and last_mm"

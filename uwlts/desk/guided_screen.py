@@ -9,7 +9,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from uwlts.calibration.guidance.pose_advice import Coverage
+from uwlts.calibration.guidance import Coverage
 from uwlts.desk.laser_switch import LaserSwitch
 from uwlts.desk.shown_state import Board, Picture
 from uwlts.errors import HardwareError

@@ -288,7 +288,7 @@ class Instrument:
             self._rig = Rig(plan, plan.stage, connected.sensor, connected.camera, stage, ahead=plan.stage.step_mm)
         return self._rig
 
-    def _moving(self, phase: str, work: Callable[[GrblStage], float]) -> None:
+    def _run_move(self, phase: str, work: Callable[[GrblStage], float]) -> None:
         self._begin(phase)
         stage, self._rig = self._stage(), None
         self._stop.clear()
@@ -297,11 +297,11 @@ class Instrument:
 
     def home(self) -> None:
         """Home the stage."""
-        self._moving("homing", GrblStage.home)
+        self._run_move("homing", GrblStage.home)
 
     def unlock(self) -> None:
         """Unlock the stage and accept its position."""
-        self._moving("unlocking", GrblStage.unlock)
+        self._run_move("unlocking", GrblStage.unlock)
 
     def move(self, position_mm: float) -> None:
         """Move the stage to a position."""

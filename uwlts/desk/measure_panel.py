@@ -253,13 +253,13 @@ class MeasurePanel:
         none = np.full(len(points), -1)
         return PointCloud(points[:, :3], points[:, 3], none, none, metadata={}), _GROWING
 
-    def _two_picked(self) -> list[np.ndarray]:
+    def _require_two(self) -> list[np.ndarray]:
         if len(self._measuring.picked) < 2:
             raise DescriptionError("click two points in the cloud first")
         return self._measuring.picked
 
     def _length(self) -> None:
-        (first, second), (cloud, without) = self._two_picked(), self._cloud()
+        (first, second), (cloud, without) = self._require_two(), self._cloud()
         found = measure_length(cloud, find_nearest_point(cloud, first), find_nearest_point(cloud, second))
         self._add(found, self._board.cloud_name, without)
 
@@ -267,7 +267,7 @@ class MeasurePanel:
         picked, (cloud, without) = self._measuring.picked, self._cloud()
         if not picked:
             raise DescriptionError("click a point in the cloud first")
-        radius, source = _positive(self._radius, "the radius about the point"), self._board.cloud_name
+        radius, source = _require_positive(self._radius, "the radius about the point"), self._board.cloud_name
         self._add(await asyncio.to_thread(fit_shape_near, cloud, picked[-1], radius, shape), source, without)
 
     def _add(self, found: PickedMeasurement, source: str, without: str) -> None:
@@ -277,8 +277,8 @@ class MeasurePanel:
     # In a section or a profile
 
     def _cut(self) -> None:
-        (first, second), (cloud, self._without) = self._two_picked(), self._cloud()
-        self._section = cut_section(cloud, first, second, width_mm=_positive(self._width, "the width"))
+        (first, second), (cloud, self._without) = self._require_two(), self._cloud()
+        self._section = cut_section(cloud, first, second, width_mm=_require_positive(self._width, "the width"))
         self._live, self._source = False, f"{self._board.cloud_name}, section"
         self._places_mm = sorted([0.0, float((second - first) @ self._section.direction)])
         self._show_section()
@@ -313,7 +313,7 @@ class MeasurePanel:
         section, (first, second) = self._section, self._places_mm
         if self._tool == "distance":
             return measure_length(section.cloud, section.find_nearest(first), section.find_nearest(second))
-        return measure_step(section, first, second, width_mm=_positive(self._width, "the width"))
+        return measure_step(section, first, second, width_mm=_require_positive(self._width, "the width"))
 
     def _keep(self) -> None:
         self._add(self._measure_section(), self._source, self._without)
@@ -456,7 +456,7 @@ class _Row:
         self._measuring.values = self._measuring.values.remove(self._number)
 
 
-def _positive(number: NumberField, called: str) -> float:
+def _require_positive(number: NumberField, called: str) -> float:
     value = float(number.value or 0.0)
     if value <= 0:
         raise DescriptionError(f"give {called}, above 0 mm")

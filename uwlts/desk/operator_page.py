@@ -225,7 +225,7 @@ class _OperatorPage:
                             part()
             view.log()
         update_regularly(self._refresh)
-        ui.timer(_LIST_S, self._list)
+        ui.timer(_LIST_S, self._update_list)
 
     def _button(
         self, label: str, press: Callable[[], object], states: tuple[InstrumentState, ...] | None = None
@@ -304,14 +304,14 @@ class _OperatorPage:
         stage = plan.stage
         self._start.value, self._step.value, self._number.value = stage.start_mm, stage.step_mm, stage.count
 
-    def _chosen_plan(self) -> ScanPlan:
+    def _require_plan(self) -> ScanPlan:
         if self._desk.plan is None:
             raise DescriptionError("choose a plan first; valid ones of the folder are offered (docs/how-to/scan.md)")
         return self._desk.plan
 
     def _connect(self) -> None:
         addresses = {"camera": self._camera.value or "", "stage": self._stage.value or None}
-        self._instrument.ask(self._instrument.connect, self._chosen_plan(), **addresses)
+        self._instrument.ask(self._instrument.connect, self._require_plan(), **addresses)
 
     def _look(self, light: str) -> None:
         wanted = None if light == "none" else "laser" if light == "laser" else "lamp"
@@ -416,7 +416,7 @@ class _OperatorPage:
             self._extent.set_text(f"{start:g} to {start + step * (count - 1):g} mm")
 
     def _record(self, *, resume: bool) -> None:
-        plan = self._chosen_plan()
+        plan = self._require_plan()
         start, step, count = self._start.value, self._step.value, self._number.value
         if start is None or step is None or count is None:
             raise DescriptionError("give the first position, the step and the number of positions")
@@ -443,9 +443,9 @@ class _OperatorPage:
 
     def _files_part(self) -> None:
         self._rows = ui.column().classes("w-full gap-1")
-        self._list()
+        self._update_list()
 
-    def _list(self) -> None:
+    def _update_list(self) -> None:
         """Update the list of files and the choices if the folder has changed."""
         try:
             files = list_files(self._desk.folder)

@@ -107,8 +107,8 @@ class FrameProfile:
 
     def _reconstruct(self, *, with_uncertainty: bool) -> PointCloud:
         stripe, line = self.stripe, self.stripe.lines
-        own, centre = np.zeros(len(line), dtype=int), stripe.centre_px[line]
-        stripes = CaptureStripes(own, line, centre, stripe.amplitude[line], stripe.width_px[line], {})
+        first, centre = np.zeros(len(line), dtype=int), stripe.centre_px[line]
+        stripes = CaptureStripes(first, line, centre, stripe.amplitude[line], stripe.width_px[line], {})
         table = FrameTable.from_frames(self.header, [self.frame])
         return reconstruct_stripes(table, stripes, self.calibration, with_uncertainty=with_uncertainty)
 

@@ -6,7 +6,7 @@ Each candidate adds information (inverse covariance) to what is known, so that i
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Generic, Self, TypeVar
+from typing import Self
 
 import numpy as np
 
@@ -60,26 +60,25 @@ class CovarianceRoot:
 class Candidate:
     """Observation that may be made next, as text, and the information (P, P) that it adds to the parameters.
 
-    ``pose`` (4, 4) is that of the object to observe, or of what carries the sensor.
+    ``pose`` (4, 4) is that of the object to observe, or of what carries the sensor; ``single`` is False if several
+    motions lead there.
     """
 
     words: str = ""
     information: np.ndarray
     pose: np.ndarray
-
-
-AnyCandidate = TypeVar("AnyCandidate", bound=Candidate)
+    single: bool = True
 
 
 @dataclass(frozen=True, eq=False)
-class Forecast(Generic[AnyCandidate]):
+class Forecast:
     """Expected effect of a candidate.
 
     ``before`` and ``after`` are the figure to be reduced without and with the candidate, as a rule the root mean square
     of the uncertainties of the functions. ``known`` is the covariance of the parameters with it.
     """
 
-    candidate: AnyCandidate
+    candidate: Candidate
     before: float
     after: float
     known: CovarianceRoot
@@ -107,10 +106,10 @@ class Forecast(Generic[AnyCandidate]):
 def rank_candidates(
     known: CovarianceRoot,
     functions: np.ndarray,
-    candidates: Iterable[AnyCandidate],
+    candidates: Iterable[Candidate],
     *,
-    figure: Callable[[np.ndarray, AnyCandidate | None], float] | None = None,
-) -> list[Forecast[AnyCandidate]]:
+    figure: Callable[[np.ndarray, Candidate | None], float] | None = None,
+) -> list[Forecast]:
     """Return the expected effect of each candidate, the most helpful one first.
 
     For several observations in turn, rank the remaining candidates again from the best forecast's ``known``.

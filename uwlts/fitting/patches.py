@@ -427,9 +427,9 @@ def _average_in_cubes(
     return Averages(means[0], counts.astype(np.float64), patterns), owner, first
 
 
-def _select_central(points: np.ndarray, apart: float) -> np.ndarray:
-    """Select the point nearest to the centre of each non-empty cube of side ``apart``."""
-    place = (points - points.min(axis=0)) / apart
+def _select_central(points: np.ndarray, spacing: float) -> np.ndarray:
+    """Select the point nearest to the centre of each non-empty cube of side ``spacing``."""
+    place = (points - points.min(axis=0)) / spacing
     cells = np.floor(place).astype(np.int64)
     off = np.sum((place - cells - 0.5) ** 2, axis=1)
     order = np.lexsort((off, *cells.T))

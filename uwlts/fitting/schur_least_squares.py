@@ -130,7 +130,7 @@ def schur_least_squares(
         # Scaled steps have the unit of residuals, summed over all of them.
         small = size <= _SMALLEST_STEP * np.sqrt(normal.count())
         settling = damping <= _HARDLY_DAMPED and not small
-        if settling and _expected_gain(normal, global_step, local_steps) <= min(smallest_gain, _SAFE) * normal.cost:
+        if settling and _predict_gain(normal, global_step, local_steps) <= min(smallest_gain, _SAFE) * normal.cost:
             # Near the solution, the linear model replaces another evaluation of all residuals.
             return _make_solution(tried_global, tried_local, normal, rounds, "cost settled")
         tried = _assemble(model, tried_global, tried_local, soft_limit)
@@ -207,8 +207,8 @@ def _assemble(
         scaled = product / np.outer(both := np.r_[global_scale, scale, 1.0], both)
         block += scaled[:count, :count]
         gradient += scaled[:count, -1]
-        own = (scaled[:count, count:-1], scaled[count:-1, count:-1], scaled[count:-1, -1])
-        groups.append(_Group(residuals, *own, scale))
+        blocks = (scaled[:count, count:-1], scaled[count:-1, count:-1], scaled[count:-1, -1])
+        groups.append(_Group(residuals, *blocks, scale))
     return _Normal(cost, block, gradient, global_scale, groups)
 
 
@@ -259,7 +259,7 @@ def invert_block(matrix: np.ndarray, *, least: float | None = None) -> np.ndarra
     return inverse
 
 
-def _expected_gain(normal: _Normal, global_step: np.ndarray, local_steps: list[np.ndarray]) -> float:
+def _predict_gain(normal: _Normal, global_step: np.ndarray, local_steps: list[np.ndarray]) -> float:
     """Return the predicted reduction of the cost for linear residuals and small damping."""
     groups = zip(normal.groups, local_steps, strict=True)
     slopes = [normal.gradient @ (normal.scale * global_step), *(g.gradient @ (g.scale * step) for g, step in groups)]
@@ -286,8 +286,8 @@ def _make_solution(
     covariance, local_covariances = np.linalg.inv(reduced), []
     for group, inverse in zip(normal.groups, inverses, strict=True):
         spread = inverse @ group.border.T
-        own = inverse + spread @ covariance @ spread.T
-        local_covariances.append(sigma**2 * own / np.outer(group.scale, group.scale))
+        total = inverse + spread @ covariance @ spread.T
+        local_covariances.append(sigma**2 * total / np.outer(group.scale, group.scale))
     return SchurFit(
         global_values=global_values,
         local=local,

@@ -1,7 +1,7 @@
 """The next pass: a motion of the sensor relative to the scene, and the uncertainty of lengths that it would leave."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,20 +20,13 @@ _LEAST_OVERLAP = 0.3
 """Smallest fraction of the cells that a candidate must see, so that poses and surface stay connected."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class NextPass(Candidate):
-    """A further pass, whose pose is in the common frame; ``single`` if it is one motion."""
-
-    single: bool
-
-
-def rank_passes(problem: PassProblem, solution: PassSolution, lengths: np.ndarray) -> list[Forecast[NextPass]]:
+def rank_passes(problem: PassProblem, solution: PassSolution, lengths: np.ndarray) -> list[Forecast]:
     """Return the effect of further passes on lengths with derivatives (L, U), the most helpful one first."""
     known = CovarianceRoot.from_covariance(solution.covariance)
     return rank_candidates(known, lengths, _candidates(problem, solution))
 
 
-def _candidates(problem: PassProblem, solution: PassSolution) -> Iterator[NextPass]:
+def _candidates(problem: PassProblem, solution: PassSolution) -> Iterator[Candidate]:
     cells = solution.cells
     places, normals = np.array([cell.middle_mm for cell in cells]), np.array([cell.normal for cell in cells])
     # The information and the mean row of all passes in a cell, and a typical pass's information.
@@ -41,8 +34,8 @@ def _candidates(problem: PassProblem, solution: PassSolution) -> Iterator[NextPa
     each = weight / np.array([len(cell.passes) for cell in cells])
     rows = np.array([cell.mean_row for cell in cells])
     first = problem.passes[0]
-    for words, pose, single in _motions(first.pose[len(first.pose) // 2], places):
-        seen = _see(problem, solution, pose, places)
+    for text, pose, single in _motions(first.pose[len(first.pose) // 2], places):
+        seen = _predict_view(problem, solution, pose, places)
         if seen is None or np.count_nonzero(seen[1]) < _LEAST_OVERLAP * len(cells):
             continue
         placed, there = seen
@@ -51,7 +44,7 @@ def _candidates(problem: PassProblem, solution: PassSolution) -> Iterator[NextPa
         by[:, :count] -= rows[there]
         information = (by.T / (1 / each[there] + 1 / weight[there]) / solution.spread**2) @ by
         information[count:, count:] += np.eye(len(information) - count)
-        yield NextPass(words=words, information=eliminate_others(information, count), pose=pose, single=single)
+        yield Candidate(words=text, information=eliminate_others(information, count), pose=pose, single=single)
 
 
 def _motions(start: np.ndarray, places: np.ndarray) -> Iterator[tuple[str, np.ndarray, bool]]:
@@ -66,16 +59,16 @@ def _motions(start: np.ndarray, places: np.ndarray) -> Iterator[tuple[str, np.nd
     turns += [
         (f"roll by {sign * deg:+.0f} deg about X", sign * deg * axes[:, 0]) for deg in _ROLLS_DEG for sign in (1, -1)
     ]
-    for words, vector in (*steps, *lifted):
-        yield words, rigid_transform(np.eye(3), vector) @ start, True
-    for words, vector in turns:
+    for text, vector in (*steps, *lifted):
+        yield text, rigid_transform(np.eye(3), vector) @ start, True
+    for text, vector in turns:
         rotation = Rotation.from_rotvec(vector, degrees=True).as_matrix()
         for also, shift in (("", np.zeros(3)), *((f"{lift} and ", shift) for lift, shift in lifted)):
             moved = rigid_transform(rotation, middle - rotation @ middle + shift)
-            yield f"{also}{words}, about the middle of the scene", moved @ start, not also
+            yield f"{also}{text}, about the middle of the scene", moved @ start, not also
 
 
-def _see(
+def _predict_view(
     problem: PassProblem, solution: PassSolution, pose: np.ndarray, places: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return derivatives (n, 3, U + `OF_PASS`) of the places that a pass would see, and their mask (N,)."""

@@ -125,9 +125,9 @@ def check_passes(cloud: PointCloud) -> PassCheck | None:
 def _find_cause(cloud: PointCloud, amplitudes: np.ndarray, covariance: np.ndarray) -> str:
     """Return the name of the group of errors whose deviation is the least probable."""
     assert cloud.uncertainty is not None
-    words = {"sensor": "the calibration", "mount": "the mount"}
+    text = {"sensor": "the calibration", "mount": "the mount"}
     shared = cloud.uncertainty.shared
-    groups = {words.get(name.split()[0], "the water's index"): by for name, by in shared.items()}
+    groups = {text.get(name.split()[0], "the water's index"): by for name, by in shared.items()}
     alone = ~np.any([np.zeros(len(amplitudes), bool), *(by.any(axis=1) for by in shared.values())], axis=0)
     groups["the poses"] = np.eye(len(amplitudes))[:, alone]
     chances = {}

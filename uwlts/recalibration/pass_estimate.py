@@ -333,9 +333,9 @@ def estimate_covariance(
     of_images = np.zeros((len(points.image_mm), int(points.image.max()) + 1, len(total)))
     spread = np.eye(len(total)) if lengths is None else np.eye(len(total)) + lengths.rows.T @ lengths.rows
     for cell, weight in zip(cells, weights, strict=True):
-        own = np.sqrt(np.maximum(1.0 - np.sum(cell.images**2, axis=0), 0.0))
+        independent = np.sqrt(np.maximum(1.0 - np.sum(cell.images**2, axis=0), 0.0))
         rows = weight * cell.apart @ (cell.apart.T @ cell.rows)
-        spread += (rows * own[:, None]).T @ (rows * own[:, None])
+        spread += (rows * independent[:, None]).T @ (rows * independent[:, None])
         for together, shares in zip(of_images, cell.images, strict=True):
             np.add.at(together, points.image[cell.some], rows * shares[:, None])
     return inverse @ (spread + np.einsum("kiu,kiv->uv", of_images, of_images)) @ inverse
@@ -346,10 +346,10 @@ def chance(amplitudes: np.ndarray, covariance: np.ndarray, directions: np.ndarra
 
     The amplitudes (U,) have a variance of one before, and a covariance (U, U) after the estimate.
     """
-    own, after = directions @ amplitudes, directions @ covariance @ directions.T
-    values, vectors = np.linalg.eigh(np.eye(len(own)) - after)
+    found, after = directions @ amplitudes, directions @ covariance @ directions.T
+    values, vectors = np.linalg.eigh(np.eye(len(found)) - after)
     tested = values > _DETERMINED
-    square = float(np.sum((vectors.T @ own)[tested] ** 2 / values[tested]))
+    square = float(np.sum((vectors.T @ found)[tested] ** 2 / values[tested]))
     return float(chdtrc(int(tested.sum()), square)) if tested.any() else 1.0
 
 
@@ -391,14 +391,14 @@ def move_mount(mount: Mount, problem: PassProblem, solution: PassSolution, calib
     std = np.sqrt(np.diag(of_parameters))
     inverse = np.linalg.pinv(of_parameters / np.outer(std, std), rcond=_NEGLIGIBLE, hermitian=True)
     by_parameters = shared[:6] @ (inverse / np.outer(std, std))
-    apart = of_mount[:6, :6] - by_parameters @ shared[:6].T
+    independent = of_mount[:6, :6] - by_parameters @ shared[:6].T
     changes: dict[str, object] = {
         "T_platform_sensor": _rows(transform),
         "covariance": _rows(0.5 * (of_mount + of_mount.T)[:6, :6]),
         "sensor": SensorShare(
             calibration=calibration_digest(calibration),
             by_parameters=_rows(by_parameters),
-            covariance_apart=_rows(0.5 * (apart + apart.T)),
+            covariance_apart=_rows(0.5 * (independent + independent.T)),
         ),
     }
     change = by @ components

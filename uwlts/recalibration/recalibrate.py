@@ -24,7 +24,7 @@ from uwlts.model.short_text import Brief
 from uwlts.model.trajectory import Trajectory
 from uwlts.optics.brightness import select_sharp_lines
 from uwlts.recalibration.as_built import as_built
-from uwlts.recalibration.next_pass import NextPass, rank_passes
+from uwlts.recalibration.next_pass import rank_passes
 from uwlts.recalibration.pass_check import split_passes
 from uwlts.recalibration.pass_estimate import (
     POOR_FIT,
@@ -147,7 +147,7 @@ class Recalibrated(Brief):
     spread: float
     parts_before: SurfaceParts
     parts: SurfaceParts
-    next_passes: tuple[Forecast[NextPass], ...]
+    next_passes: tuple[Forecast, ...]
     doubts: tuple[str, ...]
     warnings: tuple[str, ...] = ()
     mount: MovedMount | None = None
@@ -454,17 +454,17 @@ def _gather(
     # `reconstruct` adds the shift to the origin of the light, and motion during the exposure.
     beside = np.einsum("nji,nj->ni", rotation, points - origin) - found[0] - travel[:, None] * direction
     even = np.linalg.norm(beside, axis=1) < _SHIFTED * noise * np.linalg.norm(found[1][:, :, 0], axis=1)
-    own = of_images if pose is None else pose @ of_images
+    poses_here = of_images if pose is None else pose @ of_images
     if rates is not None:
         # The rates are those of the platform's origin.
-        lever = own[:, :3, 3] - table.pose[:, :3, 3]
+        lever = poses_here[:, :3, 3] - table.pose[:, :3, 3]
         rates = np.hstack([rates[:, :3] + np.cross(rates[:, 3:], lever), rates[:, 3:]])
     values = kept.frame, kept.line, kept.centre_px.astype(np.float64), noise, beside, travel
     passes, numbers = [], np.unique(pass_of)
     for number in numbers:
         some = even & (pass_of == number)
         name = scan.path.name if len(numbers) == 1 else f"{scan.path.name}, pass {number + 1}"
-        passes.append(Pass(name, *(each[some] for each in values), pose=own, rates=rates))
+        passes.append(Pass(name, *(each[some] for each in values), pose=poses_here, rates=rates))
     return passes, list(cloud.warnings)
 
 
@@ -484,7 +484,7 @@ def _add_mount(
         by[:6] = common @ root[: common.shape[1]]
     at = np.full(7, root.shape[1] - 1)
     by = np.insert(by, at, 0.0, axis=1)
-    by[:, at[0] : at[0] + 7] = own
+    by[:, at[0] : at[0] + 7] = mount_root
     return (np.insert(root, at, 0.0, axis=1), np.insert(by_stage, at, 0.0, axis=0), MountErrors(mount.transform(), by))
 
 
@@ -552,9 +552,9 @@ def _find_doubts(problem: PassProblem, solution: PassSolution, by_amplitudes: np
     limit = _FALSE_ALARM / (len(problem.passes) + 2 + (0 if lengths is None else len(lengths.names)))
     doubts = []
     if solution.spread > POOR_FIT:
-        apart = np.concatenate([cell.apart_mm**2 for cell in solution.cells])
+        variances = np.concatenate([cell.apart_mm**2 for cell in solution.cells])
         number = np.concatenate([cell.number for cell in solution.cells])
-        squares = np.bincount(number, apart) / np.maximum(np.bincount(number), 1)
+        squares = np.bincount(number, variances) / np.maximum(np.bincount(number), 1)
         doubts.append(
             f"the passes disagree {solution.spread:.1f} times as much as their noise, most of all "
             f"{problem.passes[int(np.argmax(squares))].name}: the scene moved or is too rough, or this pass is of "
@@ -583,8 +583,8 @@ def _find_doubts(problem: PassProblem, solution: PassSolution, by_amplitudes: np
     for number, each in enumerate(problem.passes):
         columns = problem.of_pass(number)
         if (probability := chance(solution.amplitudes, solution.covariance, unknowns[columns])) < limit:
-            own = solution.amplitudes[columns]
-            sizes = [np.linalg.norm(own[:3]) / np.sqrt(3), np.linalg.norm(own[3:6]) / np.sqrt(3), abs(own[6])]
+            step = solution.amplitudes[columns]
+            sizes = [np.linalg.norm(step[:3]) / np.sqrt(3), np.linalg.norm(step[3:6]) / np.sqrt(3), abs(step[6])]
             worst = int(np.argmax(sizes))
             doubts.append(
                 f"{each.name} does not fit the others (probability {probability:.1g}): {names[worst]} deviates "

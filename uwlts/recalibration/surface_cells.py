@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from uwlts.errors import CalibrationError
-from uwlts.fitting.least_squares import MAD_TO_STD
+from uwlts.fitting.least_squares import DEFAULT_K, MAD_TO_STD
 
 LINES = 4
 """One of these many profile lines is used: speckle correlates the noise of neighbours, which the surface would
@@ -24,8 +24,6 @@ CELL = 1.5
 suffices; seen on simulated surfaces with wavelengths from 45 mm."""
 _FEWEST = 8
 """Least number of points of a pass in a cell: two more than a second-order surface has coefficients."""
-_OUTLIER = 5.0
-"""Distance from a pass's own surface, in robust standard deviations, beyond which a point is left out."""
 _ROUGHEST = 5.0
 """Largest scatter about the passes' own surfaces relative to the median cell: cells on edges exceed it."""
 _CONDITION = 60.0
@@ -144,8 +142,8 @@ def _observe(points: PassPoints, some: np.ndarray, spread: float, *, fewest: int
         surface = np.column_stack([np.ones_like(u), u, v, u * u, u * v, v * v])
         # Offset and slopes of all passes but one, so that their disagreement is no scatter.
         others = points.number[some, None] == enough[1:]
-        own = (others[:, :, None] * surface[:, None, :3]).reshape(len(some), -1)
-        design = np.hstack([surface, own])
+        terms = (others[:, :, None] * surface[:, None, :3]).reshape(len(some), -1)
+        design = np.hstack([surface, terms])
         if not keep and np.linalg.cond(design) > _CONDITION:
             return None
         shape = np.linalg.lstsq(surface, w, rcond=None)[0] / size
@@ -161,7 +159,7 @@ def _observe(points: PassPoints, some: np.ndarray, spread: float, *, fewest: int
         if freedom < _FEWEST:
             return None
         robust = MAD_TO_STD * float(np.median(np.abs(left))) * np.sqrt(len(some) / freedom)
-        good = keep | (np.abs(left) <= _OUTLIER * max(robust, 1.0))
+        good = keep | (np.abs(left) <= DEFAULT_K * max(robust, 1.0))
         if good.all():
             break
         some = some[good]
@@ -171,7 +169,7 @@ def _observe(points: PassPoints, some: np.ndarray, spread: float, *, fewest: int
         return None
     scatter = max(float(np.sqrt(np.sum(left**2) / freedom)), 1.0)
     std = std * scatter
-    height, shared, apart = height / scatter, base[:, :6], base[:, 6:]
+    height, shared, independent = height / scatter, base[:, :6], base[:, 6:]
     rows = np.einsum("ni,niu->nu", up, points.by_unknowns[some]) / std[:, None]
     mean_row = (rows / std[:, None]).sum(axis=0) / np.sum(std**-2.0)
     # Heights along the mean normal, so that rows of another pass refer to the same direction.
@@ -184,10 +182,10 @@ def _observe(points: PassPoints, some: np.ndarray, spread: float, *, fewest: int
         rows - shared @ (shared.T @ rows),
         mean_row / length,
         height - shared @ (shared.T @ height),
-        apart,
+        independent,
         by_px,
         std,
         by_image / std,
         scatter,
-        float(np.sum((apart.T @ height) ** 2)) / max(apart.shape[1], 1),
+        float(np.sum((independent.T @ height) ** 2)) / max(independent.shape[1], 1),
     )

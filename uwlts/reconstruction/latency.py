@@ -67,36 +67,36 @@ def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s:
             "in both directions"
         )
     shift = float(ways[np.argmin(np.where(comparable, costs, np.inf))])
-    away = slope = weight = np.empty(0)
+    residual = slope = weight = np.empty(0)
     for _ in range(_ROUNDS):
-        away, slope, other = surface.compare(backward, shift)
-        scatter = robust_std(away - np.median(away)) if len(away) else 0.0
-        near = np.abs(away) <= max(_OUTLIER * scatter, 1e-6)
+        residual, slope, other = surface.compare(backward, shift)
+        scatter = robust_std(residual - np.median(residual)) if len(residual) else 0.0
+        near = np.abs(residual) <= max(_OUTLIER * scatter, 1e-6)
         if np.count_nonzero(near) < _FEWEST or not (slope[near] ** 2).sum() > 0:
             raise EvaluationError(
                 "the surface has too little relief along the motion to determine the latency: scan a surface with "
                 "slopes, such as a sphere, or give latency_ms"
             )
-        away, slope, weight = away[near], slope[near], np.nan_to_num(other[near])
+        residual, slope, weight = residual[near], slope[near], np.nan_to_num(other[near])
         # away = c_back(x) - c_there(x - shift); a further shift d changes it by slope d. The slope of the backward pass
         # is an instrumental variable: errors of the slope and of the value of the forward pass are correlated. Slopes
         # that are mostly noise are no instrument.
         if (weight * slope).sum() < _LEAST_COMMON * (slope**2).sum():
             weight = slope
-        further = -float((weight * away).sum() / (weight * slope).sum())
+        further = -float((weight * residual).sum() / (weight * slope).sum())
         shift += further
         if abs(further) < 1e-6:
             break
-    std = _GRAIN * float(np.std(away)) * float(np.sqrt((weight**2).sum()) / (weight * slope).sum())
+    std = _GRAIN * float(np.std(residual)) * float(np.sqrt((weight**2).sum()) / (weight * slope).sum())
     return shift / (2 * speed), std / (2 * speed)
 
 
 def _cost(surface: "_Surface", backward: "_Surface", shift: float) -> tuple[float, float]:
     """Return the mean capped distance, px, of the backward pass at a shift, and the sum of squared slopes."""
-    away, slope, _ = surface.compare(backward, shift)
-    if len(away) < _FEWEST:
+    residual, slope, _ = surface.compare(backward, shift)
+    if len(residual) < _FEWEST:
         return np.inf, 0.0
-    return float(np.mean(np.minimum(np.abs(away), _FAR_PX))), float((slope**2).sum())
+    return float(np.mean(np.minimum(np.abs(residual), _FAR_PX))), float((slope**2).sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,14 +109,14 @@ class _Surface:
 
     @classmethod
     def from_centres(cls, position: np.ndarray, centre: np.ndarray) -> "_Surface":
-        apart = position[2:] - position[:-2]
+        spacing = position[2:] - position[:-2]
         slope = np.full_like(centre, np.nan)
         across = centre[2:] - centre[:-2]
         bend = centre[2:] - 2 * centre[1:-1] + centre[:-2]
         odd = np.abs(bend)
         odd[1:-1] = np.fmin(odd[1:-1], np.abs(bend[1:-1] - (bend[2:] + bend[:-2]) / 2))
         smooth = odd < np.maximum(_MOST_BENT_PX, _MOST_BENT * np.abs(across) / 2)
-        slope[1:-1] = np.where(smooth, across / apart[:, None], np.nan)
+        slope[1:-1] = np.where(smooth, across / spacing[:, None], np.nan)
         return cls(position, centre, slope)
 
     def compare(self, other: "_Surface", shift: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -136,6 +136,6 @@ class _Surface:
         square = rise - da - cubic
         value = a + t * (da + t * (square + t * cubic))
         slope = (da + t * (2 * square + 3 * t * cubic)) / h
-        away = other.centre - value
-        good = np.isfinite(away) & ((t >= 0) & (t <= 1))
-        return away[good], slope[good], other.slope[good]
+        residual = other.centre - value
+        good = np.isfinite(residual) & ((t >= 0) & (t <= 1))
+        return residual[good], slope[good], other.slope[good]

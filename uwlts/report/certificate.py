@@ -20,7 +20,7 @@ from uwlts.calibration.joint.stored_estimate import require_joint
 from uwlts.errors import CaptureError
 from uwlts.files.json_files import SEAL, compute_seal, numbers_in, read_json
 from uwlts.files.writing import hash_file
-from uwlts.fitting.next_observation import Candidate, Forecast
+from uwlts.fitting.next_observation import Forecast
 from uwlts.model.calibration import Calibration, calibration_digest
 from uwlts.model.joint_estimate import ImageFit
 from uwlts.model.parameter_keys import ParameterKey, WindowParameter, parse_parameter
@@ -322,7 +322,7 @@ def _complete_joint(base: Certificate, calibration: Calibration) -> JointCertifi
     )
 
 
-def _shots(forecasts: Sequence[Forecast[Candidate]]) -> tuple[NextShot, ...]:
+def _shots(forecasts: Sequence[Forecast]) -> tuple[NextShot, ...]:
     """Return the best shots, and the best of each kind, in order."""
     kinds = [each.candidate.words.split(",")[0] for each in forecasts]
     return tuple(

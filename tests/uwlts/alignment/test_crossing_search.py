@@ -21,7 +21,7 @@ from uwlts.alignment.path_prior import DriftModel, PathPrior
 from uwlts.alignment.path_solution import (
     PathEstimate,
     _linearise_pair,
-    _observable_projection,
+    _project_observable,
     initial_estimate,
     refine_nodes,
     settle,
@@ -281,7 +281,7 @@ def test_a_ridge_determines_all_motions_but_that_along_it(along_deg: float):
     found = distances_between(second, np.eye(4), first, np.eye(4), reach_mm=estimate.reach_mm)
     middle = found.places_mm.mean(axis=0)
     twist = rigid_derivatives(found.places_mm, found.normals, middle)
-    projection = _observable_projection([(found, found.std_mm**-2, twist)], middle)
+    projection = _project_observable([(found, found.std_mm**-2, twist)], middle)
     np.testing.assert_allclose(projection @ projection, projection, atol=1e-6)
     assert np.linalg.matrix_rank(projection, tol=1e-3) == 5
     # Motion along the ridge has no effect, and distances keep that of the others.

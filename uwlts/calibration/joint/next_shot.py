@@ -64,7 +64,7 @@ _Simulated = tuple[StoredEstimate, Evidence, np.ndarray]
 """The estimate (with parameters that the image adds), the image's evidence, and its local parameters."""
 
 
-def rank_next_shots(calibration: Calibration) -> list[Forecast[Candidate]]:
+def rank_next_shots(calibration: Calibration) -> list[Forecast]:
     """Return possible further images, the most helpful one first; empty if the evidence covers no area.
 
     They are compared by the standard uncertainty of lengths over the volume (root mean square), mm. Their poses are
@@ -97,16 +97,16 @@ def advice_lines(calibration: Calibration) -> list[str]:
 def _generate_shots(known: StoredEstimate, region: SheetRegion) -> Iterator[Candidate]:
     """Generate images of the target, if the calibration used one, and of a step, and scans of two spheres."""
     low, high = region.outline_mm[:, 1].min(), region.outline_mm[:, 1].max()
-    depths = {words: float(low + share * (high - low)) for words, share in _PLACES.items()}
+    depths = {text: float(low + share * (high - low)) for text, share in _PLACES.items()}
     shots = [*_simulate_targets(known, region.name, depths)]
-    for words, depth in depths.items():
-        place, pose = f"in {region.name}, {words} (Z {depth:+.0f} mm),", _pose(known.calibration, np.zeros(3), depth)
+    for text, depth in depths.items():
+        place, pose = f"in {region.name}, {text} (Z {depth:+.0f} mm),", _pose(known.calibration, np.zeros(3), depth)
         spheres = f"a scan of two spheres of {_SPHERE_MM:g} mm {place}"
         shots += [(f"an image of a step {place}", pose, _simulate_step(known, depth))]
         shots += [(spheres, pose, _simulate_spheres(known, depth))]
-    for words, pose, shot in shots:
+    for text, pose, shot in shots:
         if shot is not None and (added := _compute_information(shot, len(known.values))) is not None:
-            yield Candidate(words=words, information=added, pose=pose)
+            yield Candidate(words=text, information=added, pose=pose)
 
 
 def _simulate_targets(
@@ -126,8 +126,8 @@ def _simulate_targets(
         through = " without the window" if known.calibration.window is not None and not view.window else ""
         pose = _pose(known.calibration, middle, depth, turns)
         by = "" if tilt == "square" else f" by {_TILT_DEG:g}°"
-        words = f"an image of the target in {name}{through}, {where} (Z {depth:+.0f} mm), {tilt}{by},"
-        yield words, pose, _simulate_target(replace(known, view=view), target, pose)
+        text = f"an image of the target in {name}{through}, {where} (Z {depth:+.0f} mm), {tilt}{by},"
+        yield text, pose, _simulate_target(replace(known, view=view), target, pose)
 
 
 def _pose(
@@ -208,14 +208,14 @@ def _simulate_spheres(known: StoredEstimate, depth_mm: float) -> _Simulated | No
         return None
     unknown = np.full(_SPHERES, np.inf)
     sphere = np.repeat(np.tile(np.arange(_SPHERES), _SPHERE_IMAGES), counts)
-    apart = np.full(_SPHERES - 1, _SPHERES_APART_MM)
+    spacings = np.full(_SPHERES - 1, _SPHERES_APART_MM)
     evidence = SurfaceScanEvidence(
         view=known.view,
         pixels=np.vstack(pixels),
         across=known.across(),
         beside_mm=np.zeros((3, sum(counts))),
         common_px=np.full(sum(counts), _ON_SPHERES_PX),
-        surface=ScannedSpheres(np.full(_SPHERES, _SPHERE_MM), unknown, apart, unknown[1:], sphere),
+        surface=ScannedSpheres(np.full(_SPHERES, _SPHERE_MM), unknown, spacings, unknown[1:], sphere),
         frame=np.repeat(np.repeat(np.arange(_SPHERE_IMAGES), _SPHERES), counts),
         stage_mm=positions,
         direction=frame[:3, 0],

@@ -1,4 +1,7 @@
-"""Guidance of a camera calibration: what the recorded poses determine, what is missing, and the most helpful pose."""
+"""Guidance during a calibration, without hardware: what the images determine, what is missing, and what to record next.
+
+For the camera, it is the most helpful pose of the target; for the window, depths of the step standard.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -17,15 +20,22 @@ from uwlts.calibration.camera.camera_parameters import (
     observe,
     pose_values,
 )
+from uwlts.calibration.camera.image_quality import LaserFault
 from uwlts.calibration.camera.target_poses import CameraSolution, Poses, solve_camera
+from uwlts.calibration.capture_evidence import StepEvidence
 from uwlts.calibration.sequential.sheet_fit import fit_sheet, points_on_target
-from uwlts.errors import CalibrationError, RangeError
+from uwlts.calibration.sequential.step_images import label_step
+from uwlts.errors import CalibrationError, EvaluationError, ImageError, RangeError
 from uwlts.fitting.next_observation import Candidate, CovarianceRoot, Forecast, eliminate_others, rank_candidates
-from uwlts.model.calibration import CameraModel, rigid_transform
+from uwlts.model.artefacts import StepStandard
+from uwlts.model.calibration import Calibration, CameraModel, WindowModel, rigid_transform
 from uwlts.model.parameter_keys import LensParameter
 from uwlts.model.placement import laser_pose
 from uwlts.model.sensor import Description, Medium, NotNegative, Positive, Sensor
 from uwlts.optics.camera import directions, project
+from uwlts.optics.triangulation import points_on_sheet
+from uwlts.stripe import StripeStatus, extract_stripe
+from uwlts.stripe.capture_stripes import FEWEST_LINES
 from uwlts.targets import Target, TargetView
 
 _CONTRADICTION = 3.0  # ratio to the residual of the other images above which an image contradicts them
@@ -189,9 +199,6 @@ _BEYOND = 0.05  # decides between poses once all limits are reached
 _SAME_TILT_RAD = np.radians(9.0)  # tilt difference from the advised pose without an instruction: a hand can keep it
 _SAME_PLACE = 0.15  # the same for the target's middle, relative to the image's sides
 _SAME_DISTANCE = 0.1  # the same for the distance, relative to it
-
-
-PoseAdvice = Forecast[Candidate]  # expected effect of a pose ``T_camera_target`` on `compute_shortfall`
 
 
 class CompletionLimits(Description):
@@ -363,7 +370,7 @@ def candidates(state: State, *, spin_rad: float = 0.0) -> Iterator[Candidate]:
             yield Candidate(information=added, pose=pose)
 
 
-def best_pose(state: State, *, spin_rad: float = 0.0, skipped: int = 0) -> PoseAdvice | None:
+def best_pose(state: State, *, spin_rad: float = 0.0, skipped: int = 0) -> Forecast | None:
     """Return the most helpful candidate pose after ``skipped`` skipped ones; None if no candidate shows the target.
 
     The candidates are compared by `compute_shortfall`.
@@ -426,26 +433,26 @@ def _tilt_words(aim: np.ndarray, pose: np.ndarray | None) -> str:
 
 def describe_missing(state: State) -> list[str]:
     """Describe limits that are not reached yet; empty if all are reached."""
-    said, wanted = [], state.wanted
+    texts, wanted = [], state.wanted
     if len(state.recorded) < wanted.fewest_images:
-        said.append(f"{len(state.recorded)} images, at least {wanted.fewest_images} are wanted")
+        texts.append(f"{len(state.recorded)} images, at least {wanted.fewest_images} are wanted")
     if state.solution is None:
-        said.append(state.undetermined)
+        texts.append(state.undetermined)
     std = state.std()
-    said += [
+    texts += [
         f"{key.text} is known to {std[key]:.2g} px, {limit:g} px are wanted"
         for key, limit in wanted.std_px().items()
         if key in std and std[key] > limit
     ]
     if state.coverage.share < wanted.coverage:
-        said.append(
+        texts.append(
             f"{100 * state.coverage.share:.0f} % of the image is covered, {100 * wanted.coverage:.0f} % are wanted: "
             f"most is missing at the {state.coverage.emptiest()}"
         )
     level = [side for side, short in zip(_SIDES, _find_missing_tilt(state), strict=True) if short > 0]
     if level:
-        said.append(f"never tilted away by {wanted.tilt_deg:.0f} deg: the target's {', '.join(level)}")
-    return said
+        texts.append(f"never tilted away by {wanted.tilt_deg:.0f} deg: the target's {', '.join(level)}")
+    return texts
 
 
 def describe_missing_sheet(state: State) -> list[str]:
@@ -460,3 +467,91 @@ def describe_missing_sheet(state: State) -> list[str]:
         shown = sum(len(stripe) > 0 for stripe in stripes)
         return [f"the laser line is on the target in {shown} of {len(state.recorded)} images: {error}"]
     return []
+
+
+# --- images of the step standard --------------------------------------------------------------------------------------
+
+
+PLACES = 3  # number of depths of the standard that are needed: near, middle and far
+_APART = 1 / 7  # fraction of the volume's depth
+_MOST_SATURATED = 0.05  # fraction of the lines; outlier tests tolerate this many wrong centres
+
+
+@dataclass(frozen=True, eq=False)
+class StepQuality:
+    """Stripe pixels (N, 2) on the step standard, their depth outside the nominal window, and reasons for rejection."""
+
+    pixels: np.ndarray
+    depth_mm: float | None
+    reasons: tuple[str, ...]
+
+
+def next_depth_mm(seen_mm: Sequence[float], sensor: Sensor, *, skipped: int = 0) -> float | None:
+    """Return the depth for the standard's next image, mm outside the window; None after three separate depths.
+
+    Candidates are the centres of three equal parts of the measuring volume; the one farthest from previous depths is
+    returned. After ``skipped`` skipped depths, the next candidates follow in turn.
+    """
+    if len(select_separate_depths(seen_mm, sensor)) >= PLACES:
+        return None
+    near, far = sensor.volume.near_mm, sensor.volume.far_mm
+    middles = [near + (far - near) * (2 * k + 1) / (2 * PLACES) for k in range(PLACES)]
+    middles.sort(key=lambda middle: min((abs(middle - depth) for depth in seen_mm), default=np.inf), reverse=True)
+    return middles[skipped % PLACES]
+
+
+def select_separate_depths(seen_mm: Sequence[float], sensor: Sensor) -> list[float]:
+    """Return those depths that are far from each other."""
+    chosen: list[float] = []
+    for depth in seen_mm:
+        chosen += [depth] if is_separate_depth(depth, chosen, sensor) else []
+    return chosen
+
+
+def is_separate_depth(depth_mm: float, seen_mm: Sequence[float], sensor: Sensor) -> bool:
+    """Return whether a depth differs from all others by more than a seventh of the measuring volume's depth."""
+    return all(abs(depth_mm - other) >= least_separation_mm(sensor) for other in seen_mm)
+
+
+def least_separation_mm(sensor: Sensor) -> float:
+    """Return the smallest difference between two depths of the standard, mm."""
+    return _APART * (sensor.volume.far_mm - sensor.volume.near_mm)
+
+
+def judge_step(
+    image: np.ndarray,
+    calibration: Calibration,
+    window: WindowModel,
+    standard: StepStandard,
+    *,
+    medium_index: float,
+    full_dn: int,
+) -> StepQuality:
+    """Assess a laser image (H, W) of the step standard.
+
+    ``calibration`` is that of camera and sheet in air, the window is the nominal one, and the index is relative to air.
+    ``full_dn`` is the grey value of saturation.
+    """
+    along = calibration.stripe_along
+    try:
+        stripe = extract_stripe(image, stripe_along=along, saturation=full_dn)
+    except ImageError as error:
+        return StepQuality(np.empty((0, 2)), None, (str(error),))
+    pixels, reasons = stripe.pixels(), []
+    if len(pixels) < FEWEST_LINES:
+        reason = f"the laser line is found on {len(pixels)} lines only; at least {FEWEST_LINES} are needed"
+        return StepQuality(pixels, None, (f"{reason}; is the laser on, is the standard in the sheet?",))
+    clipped = (image.max(axis=0 if along == "width" else 1) >= full_dn) & (stripe.status != StripeStatus.NO_STRIPE)
+    saturated = float(clipped.sum()) / len(pixels)
+    if saturated > _MOST_SATURATED:
+        reasons.append(LaserFault(f"stripe saturated on {100 * saturated:.0f} % of its lines; shorten laser_ms"))
+    try:
+        label_step(calibration, window, StepEvidence(pixels, standard, medium_index, "this image"))
+    except EvaluationError as error:
+        reasons.append(f"no step: {error}")
+    placed = calibration.model_copy(update={"window": window})
+    depths = points_on_sheet(placed, pixels, medium_index=medium_index).points_mm[:, 2]
+    if not np.isfinite(depths).any():
+        return StepQuality(pixels, None, (*reasons, "the laser line is not on the sheet"))
+    depth = float(np.median(depths[np.isfinite(depths)])) - window.distance_mm - window.thickness_mm
+    return StepQuality(pixels, depth, tuple(reasons))

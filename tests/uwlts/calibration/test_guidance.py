@@ -17,7 +17,7 @@ from uwlts.calibration.camera.image_quality import (
     judge_target,
     measure_shift_px,
 )
-from uwlts.calibration.guidance.pose_advice import (
+from uwlts.calibration.guidance import (
     CompletionLimits,
     RecordedPose,
     Setting,
@@ -31,13 +31,16 @@ from uwlts.calibration.guidance.pose_advice import (
     describe_missing_sheet,
     estimate_pose,
     format_pose_advice,
+    is_separate_depth,
     judge_residual,
+    judge_step,
+    next_depth_mm,
     nominal_camera,
     place_words,
+    select_separate_depths,
     solve_state,
     tilts_rad,
 )
-from uwlts.calibration.guidance.step import is_separate_depth, judge_step, next_depth_mm, select_separate_depths
 from uwlts.errors import TargetError
 from uwlts.model.artefacts import StepStandard
 from uwlts.model.calibration import WindowModel
