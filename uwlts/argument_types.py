@@ -108,7 +108,7 @@ def check_arguments(function: Callable[P, R], *, keep_inputs: bool = False) -> C
             if name not in hints or kind is inspect.Parameter.VAR_KEYWORD:
                 continue
             several = kind is inspect.Parameter.VAR_POSITIONAL
-            values = [_checked(name, each, hints[name]) for each in (value if several else (value,))]
+            values = [_check_and_convert(name, each, hints[name]) for each in (value if several else (value,))]
             bound.arguments[name] = tuple(values) if several else values[0]
         with protect_inputs(bound.arguments) if keep_inputs else nullcontext():
             return function(*bound.args, **bound.kwargs)
@@ -127,7 +127,7 @@ def _hints(function: Callable[..., Any]) -> dict[str, Any]:
     )
 
 
-def _checked(name: str, value: Any, hint: Any) -> Any:
+def _check_and_convert(name: str, value: Any, hint: Any) -> Any:
     if (converted := _convert(value, hint)) is not _MISFIT:
         return converted
     shown = _SHORT.repr(value)
@@ -227,8 +227,8 @@ def _describe(hint: Any) -> str:
     """Return the expected types as text; None, which the signature shows as default, is left out."""
     kinds = [kind for kind in union_members(hint) if kind is not NoneType]
     named = any(map(_is_path, kinds))
-    words = list(dict.fromkeys(word for kind in kinds for word in _words(kind, beside_path=named)))
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
+    names = list(dict.fromkeys(word for kind in kinds for word in _words(kind, beside_path=named)))
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
 
 
 def _words(kind: Any, *, beside_path: bool) -> list[str]:

@@ -69,7 +69,7 @@ def write_card(
     ``shards`` are path, split and number of frames of the complete shards.
     """
     per_scene, versions = description.frames_per_scene(), plan["versions"]
-    frames: dict[Split, int] = {split: sum(count for _, own, count in shards if own == split) for split in SPLITS}
+    frames: dict[Split, int] = {split: sum(count for _, part, count in shards if part == split) for split in SPLITS}
     card = DataCard(
         title=description.title,
         notes=description.notes,
@@ -88,7 +88,7 @@ def write_card(
         drawn={},
         status={},
         description=description.model_dump(mode="json"),
-        shards=tuple(Shard(name=path.name, split=own, frames=n, sha256=hash_file(path)) for path, own, n in shards),
+        shards=tuple(Shard(name=path.name, split=part, frames=n, sha256=hash_file(path)) for path, part, n in shards),
     )
     values: dict[str, list[Value]] = {}
     status: Counter[int] = Counter()
@@ -116,8 +116,8 @@ def write_card(
         }
     )
     if bright:
-        said = f"{bright} of {sum(frames.values())} images have more than {100 * _BRIGHT:g} % of their pixels"
-        log_warnings(folder, [f"{said} at the maximum: lower exposure.auto_level, frame.exposure or the ambient light"])
+        text = f"{bright} of {sum(frames.values())} images have more than {100 * _BRIGHT:g} % of their pixels"
+        log_warnings(folder, [f"{text} at the maximum: lower exposure.auto_level, frame.exposure or the ambient light"])
     # The last file: with it the data set is complete.
     write_model(folder / CARD, card, file_format=CARD_FORMAT, version=CARD_VERSION, overwrite=True)
     return card
@@ -355,17 +355,17 @@ def _render_shard(job: _Job, report: Callable[[None], None]) -> None:
     mi.set_log_level(mi.LogLevel.Error)
     with open_shard(job.path) as writer:
         for scene in job.scenes:
-            drawn, studio = _measurable(job.description, scene)
+            drawn, simulator = _draw_measurable(job.description, scene)
             for index, shot in enumerate(drawn.scene.motion.shots()):
-                taken = studio.expose(shot, index, exposure=drawn.exposures[index])
-                arrays = make_labels(studio, shot, taken, job.description.labels)
-                info = _make_frame_metadata(job.description, drawn, studio, shot, taken, index)
+                taken = simulator.expose(shot, index, exposure=drawn.exposures[index])
+                arrays = make_labels(simulator, shot, taken, job.description.labels)
+                info = _make_frame_metadata(job.description, drawn, simulator, shot, taken, index)
                 writer.add(Sample(f"{scene:06d}-{index:02d}", taken.image, arrays, info))
                 report(None)
 
 
-def _measurable(description: DataSetDescription, scene: int) -> tuple[DrawnScene, SensorSimulator]:
-    """Draw a scene until the sensor can measure it; return the scene and its studio."""
+def _draw_measurable(description: DataSetDescription, scene: int) -> tuple[DrawnScene, SensorSimulator]:
+    """Draw a scene until the sensor can measure it; return the scene and its simulator."""
     from twin.recording.sensor_simulator import SensorSimulator
 
     why = None
@@ -384,7 +384,7 @@ def _measurable(description: DataSetDescription, scene: int) -> tuple[DrawnScene
 def _make_frame_metadata(
     description: DataSetDescription,
     drawn: DrawnScene,
-    studio: SensorSimulator,
+    simulator: SensorSimulator,
     shot: Shot,
     taken: SimulatedImage,
     index: int,
@@ -399,13 +399,13 @@ def _make_frame_metadata(
         "light": shot.light,
         "stage_mm": shot.stage_mm,
         "exposure_ms": taken.exposure_ms,
-        "at_maximum": float((taken.image >= studio.sensor.detector.full_scale_dn()).mean()),
+        "at_maximum": float((taken.image >= simulator.sensor.detector.full_scale_dn()).mean()),
         "drawn": drawn.values | {EXPOSURE: drawn.exposures[index]},
-        "T_scene_object": studio.pose(shot).tolist(),
-        "T_camera_object": camera_from_object(studio.sensor).tolist(),
+        "T_scene_object": simulator.pose(shot).tolist(),
+        "T_camera_object": camera_from_object(simulator.sensor).tolist(),
     }
     if "sensor" in description.labels:
-        tables = {"sensor": drawn.sensor, "as_built": studio.sensor, "medium": studio.medium}
+        tables = {"sensor": drawn.sensor, "as_built": simulator.sensor, "medium": simulator.medium}
         known |= {name: each.model_dump(mode="json", exclude_none=True) for name, each in tables.items()}
         known["scene_description"] = drawn.scene.model_dump(mode="json", exclude_none=True)
     return known

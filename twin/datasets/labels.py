@@ -50,15 +50,15 @@ MEANINGS = {
 
 
 def make_labels(
-    studio: SensorSimulator, shot: Shot, taken: SimulatedImage, wanted: tuple[Label, ...]
+    simulator: SensorSimulator, shot: Shot, taken: SimulatedImage, wanted: tuple[Label, ...]
 ) -> dict[str, np.ndarray]:
     """Return the wanted arrays of a shot by name."""
     from twin.recording.frame_truth import find_visible_surfaces
 
     arrays: dict[str, np.ndarray] = {}
-    noise = noise_std_e(taken, studio.sensor.detector)
+    noise = noise_std_e(taken, simulator.sensor.detector)
     if {"centre", "quality", "points"} & set(wanted):
-        lines = _line_labels(studio, shot, taken, noise)
+        lines = _line_labels(simulator, shot, taken, noise)
         names: dict[str, tuple[str, ...]] = {"centre": ("centre_px", "centroid_px", "status")}
         names["quality"] = "width_px", "snr", "bound_px", "visible_fraction", "mixed_fraction"
         names["points"] = "point_mm", "normal", "object"
@@ -67,33 +67,33 @@ def make_labels(
         arrays["mask"] = make_mask(
             taken,
             noise,
-            saturation=studio.sensor.detector.full_scale_dn(),
-            along_width=studio.sensor.camera.stripe_along == "width",
+            saturation=simulator.sensor.detector.full_scale_dn(),
+            along_width=simulator.sensor.camera.stripe_along == "width",
         )
     if "light" in wanted:
         light = np.stack([taken.direct, taken.scattered_once, taken.indirect, taken.particles, taken.even])
         arrays["light_e"] = np.minimum(light, _LARGEST_HALF).astype(np.float16)
     if "target" in wanted:
-        arrays["target_px"] = _target_points(studio, shot)
+        arrays["target_px"] = _target_points(simulator, shot)
     if "depth" in wanted:
-        depth, number = find_visible_surfaces(studio.renderer, studio.pose(shot))
+        depth, number = find_visible_surfaces(simulator.renderer, simulator.pose(shot))
         arrays |= {"depth_mm": depth, "object_map": np.where(number < 0, NO_OBJECT, number).astype(np.uint8)}
     return arrays
 
 
 def _line_labels(
-    studio: SensorSimulator, shot: Shot, taken: SimulatedImage, noise: np.ndarray
+    simulator: SensorSimulator, shot: Shot, taken: SimulatedImage, noise: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Return all labels of the profile lines of a shot."""
     from twin.recording.frame_truth import make_empty_truth, select_brightest, sort_lit_crossings
 
-    camera, detector = studio.sensor.camera, studio.sensor.detector
+    camera, detector = simulator.sensor.camera, simulator.sensor.detector
     count, truth, number = camera.lines(), make_empty_truth(camera.lines()), np.full(camera.lines(), -1, np.int16)
     status = np.full(count, LineStatus.LASER_OFF, np.uint8)
-    if studio.shows(shot, "laser"):
-        found = studio.crossings(shot)
+    if simulator.shows(shot, "laser"):
+        found = simulator.crossings(shot)
         truth, order = select_brightest(found, count), sort_lit_crossings(found)
-        truth = studio.measure_line_light(shot, truth)
+        truth = simulator.measure_line_light(shot, truth)
         number[found.line[order]] = found.thing[order]
         status[:] = LineStatus.NOT_CROSSED
         status[found.line] = LineStatus.SHADOWED
@@ -108,14 +108,14 @@ def _line_labels(
     return {name: values.astype(np.float32) for name, values in floats.items()} | {"status": status, "object": number}
 
 
-def _target_points(studio: SensorSimulator, shot: Shot) -> np.ndarray:
+def _target_points(simulator: SensorSimulator, shot: Shot) -> np.ndarray:
     """Return the image points (N, 2), float32, of the scene's first calibration target."""
     from twin.recording.frame_truth import project_points
 
-    things = zip(studio.scene.objects, studio.scene.object_poses(), strict=True)
+    things = zip(simulator.scene.objects, simulator.scene.object_poses(), strict=True)
     plate, pose = next((thing, pose) for thing, pose in things if isinstance(thing, PrintedPlate))
     points = plate.described_target().points_mm @ pose[:3, :3].T + pose[:3, 3]
-    return project_points(studio.renderer, studio.pose(shot), points).astype(np.float32)
+    return project_points(simulator.renderer, simulator.pose(shot), points).astype(np.float32)
 
 
 def noise_std_e(taken: SimulatedImage, detector: Detector) -> np.ndarray:

@@ -139,11 +139,11 @@ class StudyResults:
         """Mask (N,) of the designs that meet all constraints, or of all working designs if none does."""
         return self.feasible if self.feasible.any() else self.works
 
-    def highlight(self, place: int, words: str) -> HighlightedDesign:
-        """Return a design with its sensor as built and a label that starts with ``words``."""
+    def highlight(self, place: int, text: str) -> HighlightedDesign:
+        """Return a design with its sensor as built and a label that starts with ``text``."""
         design = select_design(self.columns, place)
         return HighlightedDesign(
-            f"{words} (design {design.number})", build_sensor(self.study, design.without_results()), design
+            f"{text} (design {design.number})", build_sensor(self.study, design.without_results()), design
         )
 
 
@@ -222,7 +222,7 @@ def _rms(name: str, depth: int | None = None) -> Smooth:
     return lambda xp, p, f, mean: xp.sqrt(mean(getattr(f, name) ** 2, depth))
 
 
-def _largest(xp: ModuleType, values: Array) -> Array:
+def _choose_largest(xp: ModuleType, values: Array) -> Array:
     """Return the largest value; of equal values only one, because a maximum would sum their derivatives."""
     return xp.gather(type(values), values, int(np.argmax(values.numpy())))
 
@@ -235,8 +235,8 @@ def _coverage(xp: ModuleType, p: SensorArrays, f: Field, mean: Mean) -> Array:
 MIDDLE = DEPTHS // 2  # index of the middle depth
 SMOOTH: dict[str, Smooth] = {
     "sigma_z_rms_mm": _rms("sigma_z_mm"),
-    "sigma_z_mm": lambda xp, p, f, mean: _largest(xp, f.sigma_z_mm),
-    "sigma_y_mm": lambda xp, p, f, mean: _largest(xp, f.sigma_y_mm),
+    "sigma_z_mm": lambda xp, p, f, mean: _choose_largest(xp, f.sigma_z_mm),
+    "sigma_y_mm": lambda xp, p, f, mean: _choose_largest(xp, f.sigma_y_mm),
     "sigma_z_near_mm": _rms("sigma_z_mm", 0),
     "sigma_z_middle_mm": _rms("sigma_z_mm", MIDDLE),
     "sigma_z_far_mm": _rms("sigma_z_mm", DEPTHS - 1),

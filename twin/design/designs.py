@@ -145,10 +145,10 @@ def _parameters(study: Study, designs: Sequence[Design]) -> tuple[SensorArrays |
     for k, path in enumerate(alone):
         values[:, k] = [float(design.values[path]) for design in designs]
     besides = [name for name in study.free() if name not in alone]
-    alike: dict[tuple[Value, ...], list[int]] = {}
+    groups: dict[tuple[Value, ...], list[int]] = {}
     for place, design in enumerate(designs):
-        alike.setdefault(tuple([design.values[name] for name in besides]), []).append(place)
-    for places in alike.values():
+        groups.setdefault(tuple([design.values[name] for name in besides]), []).append(place)
+    for places in groups.values():
         first, ends = designs[places[0]], zip(values[places].min(axis=0), values[places].max(axis=0), strict=True)
         corners = list(product(*(dict.fromkeys(map(float, pair)) for pair in ends)))
         if len(corners) < len(places):

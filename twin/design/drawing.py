@@ -204,13 +204,13 @@ def _draw_module(axes: Axes, module: Module, name: str) -> None:
     axes.annotate(name, module.housing[:2].mean(axis=0), xytext=(0, 6), textcoords="offset points", ha="center")
 
 
-def _dimension(axes: Axes, start: tuple[float, float], end: tuple[float, float], words: str) -> None:
+def _dimension(axes: Axes, start: tuple[float, float], end: tuple[float, float], text: str) -> None:
     """Draw a dimension line between two points, with a text beside its middle."""
     arrow = {"arrowstyle": "<->", "color": INK, "linewidth": 0.8, "shrinkA": 0, "shrinkB": 0}
     axes.annotate("", start, end, arrowprops=arrow)
     turned, aside = (90, (-7, 0)) if start[0] == end[0] else (0, (0, 7))
     style = {"textcoords": "offset points", "ha": "center", "va": "center", "rotation": turned}
-    axes.annotate(words, np.mean([start, end], axis=0), xytext=aside, **style)
+    axes.annotate(text, np.mean([start, end], axis=0), xytext=aside, **style)
 
 
 def _draw_side(axes: Axes, view: SideView, *, labels_at: float) -> None:
@@ -236,14 +236,14 @@ def _draw_side(axes: Axes, view: SideView, *, labels_at: float) -> None:
     angles = np.linspace(0, math.copysign(view.angle_rad, float(view.sheet[0, 0] - view.sheet[-1, 0])), 60)
     arc = view.crossing + _ARC * (cross - outer) * np.stack([np.sin(angles), -np.cos(angles)], axis=1)
     axes.plot(*arc.T, color=INK, linewidth=0.8)
-    words = f"{number_text(math.degrees(view.angle_rad), 3)}°"
-    axes.annotate(words, arc[30], xytext=(0, 8), textcoords="offset points", ha="center")
+    text = f"{number_text(math.degrees(view.angle_rad), 3)}°"
+    axes.annotate(text, arc[30], xytext=(0, 8), textcoords="offset points", ha="center")
     shown = float(view.laser.origin[0])
-    words = f"baseline {number_text(view.baseline_mm)} mm"
+    text = f"baseline {number_text(view.baseline_mm)} mm"
     if abs(view.baseline_mm - shown) > 1e-3 * view.baseline_mm:
         # The baseline is not perpendicular to the stripe.
-        words = f"{number_text(shown)} mm of the {words}"
-    _dimension(axes, (0.0, 0.75 * top), (shown, 0.75 * top), words)
+        text = f"{number_text(shown)} mm of the {text}"
+    _dimension(axes, (0.0, 0.75 * top), (shown, 0.75 * top), text)
     _dimension(axes, (0.8 * left, outer), (0.8 * left, cross), f"stand-off {number_text(cross - outer)} mm")
     for depth in (outer, cross):
         axes.plot([0.8 * left, 0.0], [depth, depth], color=_THIN, linewidth=0.6)

@@ -87,9 +87,9 @@ def model_stripe(
     pose, window, (xa, xb, ya, yb) = geometry.laser, geometry.window, view.jacobian
     across = geometry.across((xa, ya)), geometry.across((xb, yb))
     from_laser = add_vectors(point, scale_vector(pose.origin, -1.0))
-    away = xp.sqrt(dot(from_laser, from_laser))
+    distance = xp.sqrt(dot(from_laser, from_laser))
     rayleigh = math.pi * p.waist_mm * p.waist_mm * p.medium_index / (p.beam_quality * p.wavelength_mm)
-    sheet = 0.5 * p.waist_mm * xp.sqrt(1 + ((away - p.waist_distance_mm) / rayleigh) ** 2)
+    sheet = 0.5 * p.waist_mm * xp.sqrt(1 + ((distance - p.waist_distance_mm) / rayleigh) ** 2)
     # Width on a profile line, for a constant pixel along the stripe.
     by_x, by_y = (pixels_per_mm(view, window, direction) for direction in (pose.normal, pose.fan))
     turned = geometry.across(by_y) * geometry.along(by_x) / geometry.along(by_y)
@@ -111,16 +111,19 @@ def model_stripe(
     fan = trace_to_points(xp, laser_window, from_laser)
     side = dot(from_laser, pose.fan)
     angle = xp.atan(fan.slope) * side / xp.sqrt(side * side + 1e-18)
-    lit = _relative_power(xp, p, angle)
+    lit = _compute_power(xp, p, angle)
     per_mm = p.power_w * lit / (2 * p.fan_half_rad) / ((1 + fan.slope * fan.slope) * fan.growth_mm)
     back = length_outside_mm(xp, window, view.path)
     way = length_outside_mm(xp, laser_window, fan) + back
     passed = xp.exp(-p.extinction_per_mm * way)
-    on_surface = per_mm / (math.sqrt(2 * math.pi) * sheet) * p.laser_window_passes(xp) * passed
+    # Transmittance of both windows: their faces, and the Beer-Lambert law.
+    in_glass = p.laser_window_faces_pass * xp.exp(-p.laser_window_absorption_per_mm * p.laser_window_thickness_mm)
+    on_surface = per_mm / (math.sqrt(2 * math.pi) * sheet) * in_glass * passed
     a, b = view.slopes
     cosine_squared = 1 / (1 + a * a + b * b)
     lens = math.pi / 4 / (number * number) * cosine_squared * cosine_squared
-    per_radiance = lens * p.window_passes(xp) / (p.medium_index * p.medium_index)
+    in_glass = p.window_faces_pass * xp.exp(-p.window_absorption_per_mm * p.window_thickness_mm)
+    per_radiance = lens * in_glass / (p.medium_index * p.medium_index)
     pixel_area = p.pixel_mm * p.pixel_mm / p.pixel_aspect
     electrons = 1e-3 * pixel_area * 1e-3 * p.wavelength_mm / PLANCK_TIMES_LIGHT * p.quantum_efficiency
     rate = on_surface * reflectance / math.pi * per_radiance * electrons * thick / sigma
@@ -163,7 +166,7 @@ def exposure_ms(xp: ModuleType, p: SensorArrays, brightest_e_per_ms: Array) -> t
     return required, select(xp, xp.isnan(p.exposure_ms), automatic, p.exposure_ms)
 
 
-def _relative_power(xp: ModuleType, p: SensorArrays, angle: Array) -> Array:
+def _compute_power(xp: ModuleType, p: SensorArrays, angle: Array) -> Array:
     """Return the power per angle divided by its mean; outside the fan, only tabulated profiles are 0."""
     gauss = xp.exp(-2 * (angle / p.fan_half_rad) ** 2) * 2 / (math.sqrt(math.pi / 2) * math.erf(math.sqrt(2)))
     lit = p.gaussian_fan * gauss + (1 - p.gaussian_fan) * (1 - p.tabulated_fan)
@@ -279,9 +282,9 @@ def evaluate_field(xp: ModuleType, p: SensorArrays, depth_mm: Array, places: Arr
     )
 
 
-def _figure(words: str, unit: str = "mm") -> Any:
+def _figure(text: str, unit: str = "mm") -> Any:
     """Return a field of `Figures` with its label and unit for pages."""
-    return field(metadata={"words": words, "unit": unit})
+    return field(metadata={"words": text, "unit": unit})
 
 
 @dataclass(frozen=True)

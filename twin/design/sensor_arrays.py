@@ -157,7 +157,7 @@ class SensorArrays:
         by_angle = place_laser(xp, baseline_mm=baseline, angle_rad=angle, roll_rad=roll, towards=towards)
         vectors = by_angle.origin, by_angle.axis, by_angle.fan, by_angle.normal
         pairs = (zip(given, found, strict=True) for given, found in zip(self.placed, vectors, strict=True))
-        return LaserFan(*(tuple(select(xp, xp.isfinite(own), own, other) for own, other in pair) for pair in pairs))
+        return LaserFan(*(tuple(select(xp, xp.isfinite(one), one, other) for one, other in pair) for pair in pairs))
 
     def geometry(self, xp: ModuleType) -> SheetGeometry:
         """Return the geometry of camera and sheet."""
@@ -185,16 +185,6 @@ class SensorArrays:
         """Return the laser's window, assumed normal to its axis."""
         distance, thickness = self.laser_window_distance_mm, self.laser_window_thickness_mm
         return WindowGeometry(axis, distance, thickness, self.laser_window_index, self.medium_index)
-
-    def window_passes(self, xp: ModuleType) -> Array:
-        """Return the transmittance of the camera's window (faces, and Beer-Lambert law)."""
-        return self.window_faces_pass * xp.exp(-self.window_absorption_per_mm * self.window_thickness_mm)
-
-    def laser_window_passes(self, xp: ModuleType) -> Array:
-        """Return the transmittance of the laser's window."""
-        return self.laser_window_faces_pass * xp.exp(
-            -self.laser_window_absorption_per_mm * self.laser_window_thickness_mm
-        )
 
     def pixel_contrast(self, xp: ModuleType) -> Array:
         """Return the speckle contrast of a pixel, averaged over its area and two incoherent polarisations."""
@@ -392,8 +382,8 @@ def compute_adjustments(xp: ModuleType, parameters: SensorArrays, follow: Sequen
     if "focus" in follow:
         changes["focus_mm"] = trace_to_points(xp, window, point).apparent_mm
     if "waist" in follow:
-        away = tuple(p - o for p, o in zip(point, pose.origin, strict=True))
-        changes["waist_distance_mm"] = xp.sqrt(dot(away, away))
+        offset = tuple(p - o for p, o in zip(point, pose.origin, strict=True))
+        changes["waist_distance_mm"] = xp.sqrt(dot(offset, offset))
     if "volume" in follow:
         middle = 0.5 * (parameters.near_mm + parameters.far_mm)
         moved = depth - parameters.outer_mm(xp) - middle

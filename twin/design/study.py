@@ -63,10 +63,6 @@ class Variable(Description):
             raise DescriptionError(f"a variable with the values {self.values} is not a range with least and most")
         return self.least, self.most
 
-    def round_value(self, value: Value) -> Value:
-        """Return the value for a design: rounded if it must be an integer."""
-        return round(float(value)) if self.whole and self.values is None else value
-
     def values_at(self, shares: np.ndarray) -> list[Value]:
         """Return the values for designs at fractions (N,) from 0 to 1 of the range or of the list."""
         if self.values is not None:

@@ -59,18 +59,14 @@ _WIDE_RANGE = 30.0  # ratio of the largest to the smallest value above which a f
 _escaped = partial(escape, quote=False)  # escape text for plotly
 
 
-def shown_figures(judged: StudyResults) -> list[str]:
-    """Return the known figures to show: objectives, constraints, then the most informative others."""
-    names = dict.fromkeys([*judged.study.figures(), *_SHOWN])
-    return [name for name in names if np.isfinite(judged.figure(name)[judged.works]).any()]
-
-
 def figures_chart(judged: StudyResults, marked: Sequence[HighlightedDesign]) -> Interactive:
     """Draw figures over the free ranges: over one, or by colour over two; over the rank if there are only choices.
 
     Each point is a working design, hollow if it misses a constraint.
     """
-    study, names = judged.study, shown_figures(judged)[:_MOST_PANELS]
+    # Objectives and constraints come first, then the most informative others.
+    study, every = judged.study, dict.fromkeys([*judged.study.figures(), *_SHOWN])
+    names = [name for name in every if np.isfinite(judged.figure(name)[judged.works]).any()][:_MOST_PANELS]
     ranges = [name for name, variable in study.variables.items() if variable.values is None][:2]
     front = judged.front(judged.of_interest)
     places = np.flatnonzero(sample(judged.works, front, _MOST_IN_PANEL))
@@ -306,7 +302,10 @@ def page_text(
         best=_rows_of(judged, judged.best_first[:_BEST]),
         best_of_each=best_of_each(judged),
         failures=tables.failure_counts(judged),
-        misses=tables.miss_counts(judged),
+        misses=[
+            (tables.bound_text(key, sign, bound), f"{(sign * (judged.figure(key)[judged.works] - bound) > 0).sum():,}")
+            for key, sign, bound in study.bounds()
+        ],
         working=int(judged.works.sum()),
     )
 

@@ -58,8 +58,8 @@ def words_and_unit(name: str) -> tuple[str, str]:
     # A medium is known by its name alone, and named waters by their medium's.
     parents = [each for each in parents if each not in ("media", key)]
     ending = next((ending for ending in _UNITS if key.endswith(ending)), "")
-    words, unit = _WHOLE.get(key, (key.removesuffix(ending), _UNITS.get(ending, "")))
-    return " ".join([*parents, words]).replace("_", " "), unit
+    text, unit = _WHOLE.get(key, (key.removesuffix(ending), _UNITS.get(ending, "")))
+    return " ".join([*parents, text]).replace("_", " "), unit
 
 
 def words_of(name: str) -> str:
@@ -69,8 +69,8 @@ def words_of(name: str) -> str:
 
 def label_of(name: str) -> str:
     """Return the label of a name with its unit, as for an axis."""
-    words, unit = words_and_unit(name)
-    return f"{words} ({unit})" if unit else words
+    text, unit = words_and_unit(name)
+    return f"{text} ({unit})" if unit else text
 
 
 def number_text(value: float | None, digits: int = 4) -> str:
@@ -129,14 +129,6 @@ def failure_counts(judged: StudyResults) -> list[tuple[str, str]]:
     """Return reasons of failure without numbers, and their counts, the most frequent first."""
     counts = Counter(without_numbers(text) for text in judged.failures if text)
     return [(text, f"{count:,}") for text, count in counts.most_common()]
-
-
-def miss_counts(judged: StudyResults) -> list[tuple[str, str]]:
-    """Return the constraints as texts, and the number of working designs that violate each."""
-    return [
-        (bound_text(name, sign, bound), f"{(sign * (judged.figure(name)[judged.works] - bound) > 0).sum():,}")
-        for name, sign, bound in judged.study.bounds()
-    ]
 
 
 def bound_text(name: str, sign: int, bound: float) -> str:

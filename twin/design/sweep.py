@@ -46,7 +46,7 @@ from twin.recording.campaigns import PLAN, keep_to_plan, make_folder, require_at
 from twin.rendering_options import CPU, Variant
 from uwlts.errors import CaptureError, DescriptionError
 from uwlts.files.reading import require_regular_file
-from uwlts.files.writing import write_atomically
+from uwlts.files.writing import write_atomically, write_file
 from uwlts.model.short_text import Brief
 from uwlts.pages.toolkit import write_page
 from uwlts.runtime.progress import ProgressListener, ignore_progress
@@ -69,8 +69,7 @@ def encode_part(columns: Columns) -> bytes:
 
 def write_part(folder: Path, first: int, content: bytes, *, lost: bool = False) -> None:
     """Write a part and replace an older one of the same batch."""
-    with write_atomically(part_path(folder, first, lost=lost), overwrite=True) as aside:
-        aside.write_bytes(content)
+    write_file(part_path(folder, first, lost=lost), content, overwrite=True)
     if not lost:
         part_path(folder, first, lost=True).unlink(missing_ok=True)
 
@@ -217,9 +216,11 @@ def _propose(study: Study, folder: Path, workers: int) -> Iterator[tuple[int, li
         if (left := study.sampling.designs - done) <= 0:
             return
         trials = [search.ask(space) for _ in range(min(study.sampling.batch, left))]
-        asked = [
-            Design(one.number, {name: free[name].round_value(one.params[name]) for name in free}) for one in trials
-        ]
+        whole = {name for name in free if free[name].whole and free[name].values is None}
+        drawn = (
+            {name: round(one.params[name]) if name in whole else one.params[name] for name in free} for one in trials
+        )
+        asked = [Design(one.number, values) for one, values in zip(trials, drawn, strict=True)]
         share = -(-len(asked) // workers)
         shares = [tuple(asked[i : i + share]) for i in range(0, len(asked), share)]
         yield done, [Batch(study, designs, designs[0].number, len(designs)) for designs in shares]
@@ -304,9 +305,10 @@ class SweepResult(Brief):
                 lines.append(f"rendered {found.label}: {found.failure}")
                 continue
             verdict = "formulas and rendering agree" if found.agrees else "FORMULAS AND RENDERING DISAGREE"
+            error_mm = max((abs(error) for error in found.error_mm if math.isfinite(error)), default=math.nan)
             lines.append(
                 f"rendered {found.label}: {verdict}, scatter {found.rendered_over_predicted:.2f} of the predicted one, "
-                f"largest systematic error {found.largest_error_mm:.3f} mm, {found.seconds:.0f} s"
+                f"largest systematic error {error_mm:.3f} mm, {found.seconds:.0f} s"
             )
         return [*lines, f"wrote {self.folder / PAGE}, {TABLE}, {SUMMARY} and {WINNER}"]
 
@@ -385,8 +387,7 @@ def sweep(
         winner = marked[-1]
         notes = f"{winner.label} of the study: {described.title}"
         sensor = winner.sensor.model_copy(update={"name": f"{winner.sensor.name}-winner", "notes": notes})
-        with write_atomically(folder / WINNER, overwrite=True) as aside:
-            aside.write_text(tomli_w.dumps(sensor.model_dump(mode="json", exclude_none=True)), encoding="utf-8")
+        write_file(folder / WINNER, tomli_w.dumps(sensor.model_dump(mode="json", exclude_none=True)), overwrite=True)
         agreements: list[Agreement] = []
         if described.verify:
             rendered = [winner, *(one for one in marked if one.design.number < 0), *further]

@@ -148,11 +148,11 @@ def _evaluate_points(points: np.ndarray, stage_mm: np.ndarray) -> VerifiedMeasur
             "needed at one depth: check that the stripe is bright enough and in focus"
         )
     nothing = (math.nan, math.nan, 0.0)
-    figures = np.array([_profile(p) if good else nothing for p, good in zip(found, enough, strict=True)])
+    figures = np.array([_measure_profile(p) if good else nothing for p, good in zip(found, enough, strict=True)])
     return VerifiedMeasurements(-stage_mm[order], np.array([*map(len, found)]), *figures.T)
 
 
-def _profile(points_yz: np.ndarray) -> tuple[float, float, float]:
+def _measure_profile(points_yz: np.ndarray) -> tuple[float, float, float]:
     """Return scatter, mean deviation and length, mm, of a profile (N, 2) of Z = 0, as in `VerifiedMeasurements`."""
     used = points_yz
     # The first fit includes outliers; the second one excludes them.
@@ -193,11 +193,6 @@ class Agreement:
     predicted_exposure_ms: float = math.nan
     seconds: float = math.nan
     failure: str = ""
-
-    @property
-    def largest_error_mm(self) -> float:
-        """Largest systematic error, NaN if it is unknown."""
-        return max((abs(error) for error in self.error_mm if math.isfinite(error)), default=math.nan)
 
 
 def verify_candidate(study: Study, candidate: HighlightedDesign, *, workers: int, variant: str) -> Agreement:

@@ -238,7 +238,7 @@ class GigeCamera:
             self._faults[fault] = frames
             self._delay_s = delay_s if fault == "delay" else self._delay_s
 
-    def _meets(self, fault: str) -> bool:
+    def _apply_fault(self, fault: str) -> bool:
         """Return whether a fault applies to the present frame, and count it; call only with the lock held."""
         met = self._faults[fault] > 0
         self._faults[fault] -= met
@@ -346,7 +346,7 @@ class GigeCamera:
             self._stopping.wait(0.5e-6 * exposure_us)
             self._maker_thread.submit(self._develop, self._expose(), 1e-3 * exposure_us)
             return
-        shot = self._due(1e-3 * exposure_us)
+        shot = self._choose_image(1e-3 * exposure_us)
         if shot is not None:
             self._send(shot)
 
@@ -376,11 +376,11 @@ class GigeCamera:
         with self._lock:
             if self._server is None:
                 return
-            if self._last is not None and self._meets("repeat"):
+            if self._last is not None and self._apply_fault("repeat"):
                 shot = self._last
             self._last = shot
             self._number = self._number % _LAST_NUMBER + 1
-            dropped, shortened = self._meets("drop"), self._meets("cut")
+            dropped, shortened = self._apply_fault("drop"), self._apply_fault("cut")
             names = (_Register.STREAM_IP, _Register.STREAM_PORT, _Register.PACKET_SIZE)
             host, port, packet_bytes = map(self._read_register, names)
             x, y, width, height = map(self._read_register, _REGION)
@@ -401,7 +401,7 @@ class GigeCamera:
                 packets = [packet for index, packet in enumerate(packets) if index not in lost]
             send_paced(self._stream, packets, (socket.inet_ntoa(struct.pack(">I", host)), port & 0xFFFF))
 
-    def _due(self, exposure_ms: float) -> _Shot | None:
+    def _choose_image(self, exposure_ms: float) -> _Shot | None:
         """Return the image to send now; None while it is being made."""
         triggered = bool(self._library.arv_fake_camera_is_in_software_trigger_mode(self._camera))
         with self._lock:
@@ -439,7 +439,7 @@ class GigeCamera:
 
     def _make(self, exposure_ms: float) -> _Shot:
         with self._lock:
-            delay_s = self._delay_s if self._meets("delay") else 0.0
+            delay_s = self._delay_s if self._apply_fault("delay") else 0.0
         self._stopping.wait(delay_s)
         began_ns = time.monotonic_ns()
         image = self._frame(exposure_ms)

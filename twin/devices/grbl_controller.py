@@ -116,8 +116,9 @@ class GrblController:
             lit = self._powered and not self._laser_broken and (self._port_open or not self._gated)
             power = self._firmware.laser_power() if lit else 0.0
             time_s = time.monotonic()
-            position, speed = self._firmware.stage_at((time_s - self._origin) * self._speed_up)
-            return StageState(time_s, position, speed * self._speed_up, power > 0, power, self._port_open)
+            at_mm, speed = self._firmware.axis.state_at((time_s - self._origin) * self._speed_up)
+            at_mm += self._firmware.shift_mm
+            return StageState(time_s, at_mm, speed * self._speed_up, power > 0, power, self._port_open)
 
     @property
     def lights(self) -> tuple[LitTime, ...]:

@@ -129,11 +129,6 @@ class GrblFirmware:
         self.shift_mm, self.short_steps, self._starts = position_mm, 0, 0
         self.restart()
 
-    def stage_at(self, time_s: float) -> tuple[float, float]:
-        """Return the true position in mm and signed speed in mm/s at a time of the controller, now or just before."""
-        position, speed = self.axis.state_at(time_s)
-        return position + self.shift_mm, speed
-
     @property
     def step_mm(self) -> float:
         """Length of one step."""
@@ -224,7 +219,7 @@ class GrblFirmware:
             self._greet()
         while not self._critical:
             if self._job is None:
-                line = None if self.axis.held else self._next_line()
+                line = None if self.axis.held else self._read_line()
                 if line is None:
                     return
                 self._job = self._answer(line)
@@ -236,7 +231,7 @@ class GrblFirmware:
                 # An alarm or a reset within the job has already discarded it.
                 self._job = None if self._job is job else self._job
 
-    def _next_line(self) -> str | None:
+    def _read_line(self) -> str | None:
         """Return the next complete line, without spaces and comments; None if there is none."""
         ends = [at for at in (self._input.find(b"\n"), self._input.find(b"\r")) if at >= 0]
         if not ends:
@@ -251,7 +246,7 @@ class GrblFirmware:
             if len(line) > _LONGEST_LINE:
                 raise GrblError(11)
             if line.startswith("$"):
-                yield from self._system_command(line)
+                yield from self._run_system_command(line)
             elif line and self._mode == "Alarm":
                 raise GrblError(9)
             elif line:
@@ -318,7 +313,7 @@ class GrblFirmware:
             now = self._now()
             left, last = left if self.axis.held else left - (now - last), now
 
-    def _system_command(self, line: str) -> Generator[None, None, None]:
+    def _run_system_command(self, line: str) -> Generator[None, None, None]:
         idle = self._mode == "Alarm" or not self.axis.pending
         if line == "$G":
             modes = " ".join((self._modal["motion"], "G54 G17", self._modal["units"], self._modal["distance"], "G94"))

@@ -178,12 +178,12 @@ class Bench:
     With ``lamp``, the lamp is on while the laser is off. Raises DesignError if the detector does not have 8 bits.
     """
 
-    def __init__(self, studio: "SensorSimulator", *, state: Callable[[], StageState], track: Track, lamp: bool):
-        bits = studio.sensor.detector.bits
+    def __init__(self, simulator: "SensorSimulator", *, state: Callable[[], StageState], track: Track, lamp: bool):
+        bits = simulator.sensor.detector.bits
         if bits != 8:
             raise DesignError(f"the served camera has 8 bits, the sensor's detector {bits}: set bits = 8")
         self.rates = FrameRates()
-        self._studio, self._state, self._track, self._lamp = studio, state, track, lamp
+        self._simulator, self._state, self._track, self._lamp = simulator, state, track, lamp
         self._travelled_mm = math.nan
         self._seen: dict[str, np.ndarray] = {}
 
@@ -191,7 +191,7 @@ class Bench:
         """Compile the kernels for laser images with a trial image, because the compilation exceeds an exposure."""
         state = replace(self._state(), laser_on=True, power=1.0)
         light = self._electrons_per_ms(state, None)
-        self._studio.detect(exposure_ms * light, exposure_ms=exposure_ms, noise_seed=[self._studio.options.seed])
+        self._simulator.detect(exposure_ms * light, exposure_ms=exposure_ms, noise_seed=[self._simulator.options.seed])
         self._travelled_mm = math.nan
 
     def frame(self, exposure_ms: float, state: StageState | None = None) -> np.ndarray:
@@ -200,9 +200,9 @@ class Bench:
         A given state includes motion blur. The noise is different in each call.
         """
         began, known, travel = time.perf_counter(), len(self._seen), None
-        if state is not None and state.moving and self._studio.options.effects.motion:
+        if state is not None and state.moving and self._simulator.options.effects.motion:
             velocity = state.speed_mm_per_s * self._track.motion.unit_direction()
-            travel = self._studio.travel_at(velocity, np.zeros(3), exposure_ms=exposure_ms)
+            travel = self._simulator.travel_at(velocity, np.zeros(3), exposure_ms=exposure_ms)
         state = state or self._state()
         if travel is not None:
             self._seen.clear()
@@ -210,8 +210,8 @@ class Bench:
         light = exposure_ms * self._electrons_per_ms(state, travel)
         if travel is not None:
             self._seen.clear()
-        noise_seed = [self._studio.options.seed, _NOISE, self.rates.frames]
-        image = self._studio.detect(light, exposure_ms=exposure_ms, noise_seed=noise_seed)
+        noise_seed = [self._simulator.options.seed, _NOISE, self.rates.frames]
+        image = self._simulator.detect(light, exposure_ms=exposure_ms, noise_seed=noise_seed)
         seconds, rates = time.perf_counter() - began, replace(self.rates, frames=self.rates.frames + 1)
         if at_rest and len(self._seen) == known:
             self.rates = replace(rates, repeating_s=rates.repeating_s + seconds)
@@ -235,11 +235,11 @@ class Bench:
 
     def _light(self, light: Light, state: StageState, travel: "Travel | None") -> np.ndarray:
         if light not in self._seen:
-            shot, options = self._track.shot(state.position_mm, light), self._studio.options
+            shot, options = self._track.shot(state.position_mm, light), self._simulator.options
             # Position in whole um as a non-negative seed.
             place = round(1e3 * shot.travelled_mm) % 2**32
             seed = int(np.random.SeedSequence([options.seed, _WALKS, place]).generate_state(1)[0])
-            self._seen[light] = self._studio.electrons_per_ms(shot, spp=options.spp, seed=seed, travel=travel)
+            self._seen[light] = self._simulator.electrons_per_ms(shot, spp=options.spp, seed=seed, travel=travel)
         return self._seen[light]
 
 
@@ -378,7 +378,7 @@ def serve(
     lamp = "lamp" in motion.lights if lamp is None else lamp
     # The controller moves the stage, and a frame can need any light.
     at_rest = {"lights": ("lamp", "laser") if lamp else ("laser",), "speed_mm_per_s": 0.0}
-    studio = SensorSimulator(built, replace_values(described, motion=at_rest), options)
+    simulator = SensorSimulator(built, replace_values(described, motion=at_rest), options)
     settings = {
         _STEPS_PER_MM: 1 / built.stage.resolution_mm,
         _SPEED: 60 * built.stage.speed_mm_per_s,
@@ -386,7 +386,7 @@ def serve(
         _TRAVEL: built.stage.travel_mm,
     }
     controller = GrblController(settings=settings, position_mm=track.start_mm, speed_up=speed_up)
-    bench = Bench(studio, state=controller.state, track=track, lamp=lamp)
+    bench = Bench(simulator, state=controller.state, track=track, lamp=lamp)
     numbers = count(1)
 
     def inject(number: int, *, ahead: bool) -> None:
@@ -402,7 +402,7 @@ def serve(
         inject(number + 1, ahead=True)
         return image
 
-    if studio.peak_finder is not None and built.camera.stripe_along != "width":
+    if simulator.peak_finder is not None and built.camera.stripe_along != "width":
         raise DesignError("the profile lines of a 3D camera are its columns: use a sensor with stripe_along = 'width'")
 
     def expose() -> ExposedFrame:
@@ -419,11 +419,11 @@ def serve(
         frame,
         width_px=built.camera.width_px,
         height_px=built.camera.height_px,
-        scan3d=studio.peak_finder,
+        scan3d=simulator.peak_finder,
         encoder=controller.steps,
         expose=expose,
     )
     inject(1, ahead=True)
-    bench.prepare(studio.exposure_ms["laser"])
+    bench.prepare(simulator.exposure_ms["laser"])
     with controller, camera:
-        yield ServedTwin(controller, camera, track, studio.exposure_ms, lambda: bench.rates)
+        yield ServedTwin(controller, camera, track, simulator.exposure_ms, lambda: bench.rates)

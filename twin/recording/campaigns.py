@@ -15,7 +15,7 @@ from twin.scene.campaign import Campaign, Take, list_takes, load_campaign
 from twin.scene.description import Scene
 from uwlts.errors import CaptureError, DescriptionError, Error, OutputError, SetupError
 from uwlts.files.json_files import describe_other_plan, read_json
-from uwlts.files.writing import write_atomically
+from uwlts.files.writing import write_file
 from uwlts.model.sensor import Sensor
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.runtime.workers import open_workers, run_jobs
@@ -239,8 +239,7 @@ def keep_to_plan(
         raise DescriptionError(
             f"{folder} would keep {called} {how}, such as {min(kept)}: give another folder, or remove them first"
         )
-    with write_atomically(path, overwrite=True) as aside:
-        aside.write_text(text, encoding="utf-8")
+    write_file(path, text, overwrite=True)
 
 
 def _record(job: _Job, report: Callable[[None], None] = lambda _: None) -> None:

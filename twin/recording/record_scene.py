@@ -52,11 +52,11 @@ def record_scene(
     for beside in (truth_path(path), *([] if report is None else [trajectory_path(path)])):
         if beside.exists() and not (overwrite or resume):
             raise OutputError(f"{beside} exists already; give another name, or `overwrite` to replace it")
-    studio = SensorSimulator(as_built or sensor, scene, options)
+    simulator, drawn = SensorSimulator(as_built or sensor, scene, options), {"seed": options.seed, "spp": options.spp}
     # The header contains only what an operator knows: nominal values.
     header = CaptureHeader(
         name=path.stem,
-        sensor=with_window(sensor, mounted=studio.sensor.camera.window.mounted),
+        sensor=with_window(sensor, mounted=simulator.sensor.camera.window.mounted),
         medium_name=scene.medium,
         medium=medium_of(sensor, scene),
         stage_direction=(1.0, 0.0, 0.0) if isinstance(motion, Platform) else motion.recorded_direction(),
@@ -67,9 +67,8 @@ def record_scene(
         provenance={
             "source": "twin",
             "scene": scene_digest(scene.model_dump(mode="json")),
-            "seed": studio.options.seed,
-            "spp": studio.options.spp,
-            "effects": [*studio.options.names()],
+            **drawn,
+            "effects": [*simulator.options.names()],
             "variant": mi.variant(),
             **{package: version(package) for package in ("mitsuba", "drjit", "uwlts")},
         },
@@ -78,14 +77,9 @@ def record_scene(
     truths: list[FrameTruth] = []
     dtype = np.dtype(np.uint8 if sensor.detector.bits == 8 else np.uint16)
     # The true values must not be known to the evaluation, so the finished capture does not contain the plan.
-    plan: Table = {
-        "scene": scene.model_dump(mode="json"),
-        "as_built": studio.sensor.model_dump(mode="json"),
-        "seed": studio.options.seed,
-        "spp": studio.options.spp,
-    }
+    plan: Table = {"scene": scene.model_dump(mode="json"), "as_built": simulator.sensor.model_dump(mode="json")} | drawn
     known = isinstance(motion, Platform) and motion.states_covariance
-    lines = studio.peak_finder is not None
+    lines = simulator.peak_finder is not None
     kinds = {"centre_lines": lines, "moving": motion.stage_speed_mm_s() != 0, "covariances": known}
     files = {"overwrite": overwrite, "resume": resume}
     with (
@@ -96,7 +90,7 @@ def record_scene(
         done = len(writer)
 
         def take(light: ShotLight, shot: Shot, index: int) -> None:
-            writer.append(studio.frame_of(light, shot, index))
+            writer.append(simulator.frame_of(light, shot, index))
             # This processor is free until the next image: kernels that are running now use it too.
             dr.set_thread_count(threads)
 
@@ -109,8 +103,8 @@ def record_scene(
         before: Future[None] | None = None
         for index, shot in enumerate(shots):
             # The light first: the truth uses the stripe's position that it found.
-            light = studio.light(shot, index) if index >= done else None
-            truths.append(studio.truth(shot))
+            light = simulator.light(shot, index) if index >= done else None
+            truths.append(simulator.truth(shot))
             if index > 0:
                 end(index - 1, before)
             before = None
@@ -123,13 +117,13 @@ def record_scene(
         end(len(shots) - 1, before)
         if report is not None:
             Trajectory(*report).save(trajectory_path(path), overwrite=overwrite or resume)
-        described = TruthHeader(sensor=studio.sensor, medium=studio.medium, scene=scene.model_dump(mode="json"))
-        truth = truth_of_recording(studio, truths, shots)
+        described = TruthHeader(sensor=simulator.sensor, medium=simulator.medium, scene=scene.model_dump(mode="json"))
+        truth = truth_of_recording(simulator, truths, shots)
         write_truth(truth_path(path), described, truth, overwrite=overwrite or resume)
 
 
-def truth_of_recording(studio: SensorSimulator, truths: Sequence[FrameTruth], shots: Sequence[Shot]) -> Truth:
+def truth_of_recording(simulator: SensorSimulator, truths: Sequence[FrameTruth], shots: Sequence[Shot]) -> Truth:
     """Combine the truths of a recording's frames, with the depth map of the first shot."""
     stacked = {f.name: np.stack([getattr(truth, f.name) for truth in truths]) for f in fields(FrameTruth)}
-    poses = np.stack([studio.pose(shot) for shot in shots])
-    return Truth(**stacked, depth_mm=find_visible_surfaces(studio.renderer, poses[0])[0], pose=poses)
+    poses = np.stack([simulator.pose(shot) for shot in shots])
+    return Truth(**stacked, depth_mm=find_visible_surfaces(simulator.renderer, poses[0])[0], pose=poses)

@@ -110,15 +110,16 @@ def render(
     from twin.recording.record_scene import truth_of_recording
     from twin.recording.sensor_simulator import SensorSimulator
 
-    studio = SensorSimulator(built, described, options)
+    simulator = SensorSimulator(built, described, options)
     # The truth of each frame after its light, which it uses.
-    taken, truths = zip(*((studio.frame(shot, number), studio.truth(shot)) for number, shot in shots), strict=True)
+    pairs = [(simulator.frame(shot, number), simulator.truth(shot)) for number, shot in shots]
+    taken, truths = zip(*pairs, strict=True)
     return Recording(
         np.stack([frame.image for frame in taken]),
         *(np.array([getattr(frame, name) for frame in taken]) for name in FRAME_DATA),
-        truth=truth_of_recording(studio, truths, shots=[shot for _, shot in shots]),
-        sensor=studio.sensor,
-        medium=studio.medium,
+        truth=truth_of_recording(simulator, truths, shots=[shot for _, shot in shots]),
+        sensor=simulator.sensor,
+        medium=simulator.medium,
         scene=described,
     )
 

@@ -224,7 +224,7 @@ class SensorSimulator:
             even = even + self._lamp_ring
         if not self.shows(shot, "laser"):
             return even, None
-        lines = self._true_stripe(shot).surface_lines() if with_truth else None
+        lines = self._find_true_stripe(shot).surface_lines() if with_truth else None
         laser = self.renderer.laser_frame(
             pose, spp=spp, seed=seed, travel=travel, through_water=through_water, lines=lines
         )
@@ -238,9 +238,9 @@ class SensorSimulator:
         if laser is not None:
             seen = self._apply_lens(self._add_speckle(laser, shot) if speckle else laser.irradiance())
             light = light + (seen if self._laser_shares is None else self._laser_shares * seen)
-        return self._to_electrons(light)
+        return self._convert_to_electrons(light)
 
-    def _to_electrons(self, irradiance: np.ndarray) -> np.ndarray:
+    def _convert_to_electrons(self, irradiance: np.ndarray) -> np.ndarray:
         sensor = self.sensor
         return electrons_per_ms(irradiance, sensor.camera, sensor.detector, wavelength_nm=sensor.laser.wavelength_nm)
 
@@ -340,7 +340,7 @@ class SensorSimulator:
             if not light.any():
                 return nothing
             passed = self._apply_lens(light)
-            mean = exposure_ms * self._to_electrons(passed if shares is None else shares * passed)
+            mean = exposure_ms * self._convert_to_electrons(passed if shares is None else shares * passed)
             return np.maximum(mean, 0, dtype=np.float32)
 
         parts = [nothing] * 4
@@ -360,7 +360,7 @@ class SensorSimulator:
         """Return the ground truth of every profile line of a shot."""
         if not self.shows(shot, "laser"):
             return make_empty_truth(self.sensor.camera.lines())
-        return self.measure_line_light(shot, self._true_stripe(shot))
+        return self.measure_line_light(shot, self._find_true_stripe(shot))
 
     def crossings(self, shot: Shot) -> Crossings:
         """Return all crossings of the sheet with surfaces in a shot; those of the last light are known."""
@@ -373,7 +373,7 @@ class SensorSimulator:
         pose, travel = self.pose(shot), self.travel(shot)
         return measure_line_light(self.renderer, pose, truth, spp=self.options.spp, travel=travel)
 
-    def _true_stripe(self, shot: Shot) -> FrameTruth:
+    def _find_true_stripe(self, shot: Shot) -> FrameTruth:
         """Return the truth of a shot without its light."""
         return select_brightest(self.crossings(shot), self.sensor.camera.lines())
 
@@ -408,14 +408,9 @@ class SensorSimulator:
             even, laser = self._light(shot, spp=PROBE_SPP, seed=0, travel=None)
             # If one shot suffices, skip its speckle, which would double the time.
             peaks = self._electrons_per_ms(even, laser, shot, speckle=probe == "scan").max(axis=axis)
-            brightest = max(brightest, lit_level(peaks))
+            reference = np.sort(peaks)[-1 - min(STRAY_LINES, len(peaks) - 1)]
+            lit = peaks[peaks > LIT_SHARE * reference]
+            brightest = max(brightest, float(np.quantile(lit, BRIGHT_SHARE)) if len(lit) else 0.0)
         longest = self.sensor.exposure.longest_ms
         level = self.sensor.exposure.auto_level * self.sensor.detector.full_well_e
         return min(longest, level / brightest) if brightest > 0 else longest
-
-
-def lit_level(peaks: np.ndarray) -> float:
-    """Return the light that few lit lines exceed, from the brightest pixel of every line (L,); 0 if no line is lit."""
-    reference = np.sort(peaks)[-1 - min(STRAY_LINES, len(peaks) - 1)]
-    lit = peaks[peaks > LIT_SHARE * reference]
-    return float(np.quantile(lit, BRIGHT_SHARE)) if len(lit) else 0.0

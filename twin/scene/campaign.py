@@ -122,7 +122,7 @@ def load_campaign(name_or_path: str | Path) -> Campaign:
     path = find_description(name_or_path, FOLDER)
     levels = read_levels(path, FOLDER)
     # A base's sensor as built is no variation of another sensor.
-    naming = next((each.own for each in levels[::-1] if {"sensor", "as_built"} & each.own.keys()), {})
+    naming = next((each.stated for each in levels[::-1] if {"sensor", "as_built"} & each.stated.keys()), {})
     table = levels[-1].merged | {"as_built": naming.get("as_built", naming.get("sensor", ""))}
     campaign = validate_description(Campaign, table, path)
 
@@ -179,15 +179,17 @@ def _take(
     # Calibrations keep all images, and scans at least five profiles.
     stage = scene.motion
     if isinstance(stage, Motion) and scene.target is None and stage.count >= 5 * every and every > 1:
-        scene = _with_motion(scene, step_mm=stage.step_mm * every, count=-(-stage.count // every))
+        scene = _change_motion(scene, step_mm=stage.step_mm * every, count=-(-stage.count // every))
     rng = np.random.default_rng([drawn.seed, *name.encode()])
     if not recording.as_described:
         scene = drawn.apply_imperfections(scene, rng)
-        built = drawn.set_true_water(built, calibrating=scene.target is not None or _shows_step(scene))
+        warmer = drawn.warmer_k[scene.target is not None or _shows_step(scene)]
+        media = {key: each if each.kind == "air" else each.warmer_by(warmer) for key, each in built.media.items()}
+        built = replace_values(built, media=media)
     return Take(name, scene, sensor, built, int(rng.integers(2**31)))
 
 
-def _with_motion(scene: Scene, **changes: object) -> Scene:
+def _change_motion(scene: Scene, **changes: object) -> Scene:
     motion = validate_description(type(scene.motion), scene.motion.model_dump() | changes, scene.title)
     return scene.model_copy(update={"motion": motion})
 
@@ -218,7 +220,8 @@ class _SampledImperfections:
         self.sensor = replace_values(built, camera={"window": changed, "focus_distance_mm": focus}, laser=laser)
         self._lead = size.stage_lead_std * rng.standard_normal()
         self._scan_angles = size.stage_misalignment_std_deg * rng.standard_normal(2)
-        self._warmer_calibrating, self._warmer_measuring = size.temperature_half_width_c * rng.uniform(-1, 1, 2)
+        # By whether the water is that of the calibration.
+        self.warmer_k = dict(zip((True, False), size.temperature_half_width_c * rng.uniform(-1, 1, 2), strict=True))
         self._target = {
             "centre_std_mm": size.circle_centre_std_mm,
             "stretch": tuple(size.target_stretch_std * each for each in stretch),
@@ -227,12 +230,6 @@ class _SampledImperfections:
             "errors_seed": seed,
         }
         self._lower_step = size.step_height_half_width_mm * rng.uniform(-1, 1)
-
-    def set_true_water(self, sensor: Sensor, *, calibrating: bool) -> Sensor:
-        """Return the sensor in water of the true temperature."""
-        warmer = self._warmer_calibrating if calibrating else self._warmer_measuring
-        media = {key: each if each.kind == "air" else each.warmer_by(warmer) for key, each in sensor.media.items()}
-        return replace_values(sensor, media=media)
 
     def apply_imperfections(self, scene: Scene, rng: np.random.Generator) -> Scene:
         """Return the scene with the errors of target, step and stage; ``rng`` draws the errors of this recording."""
@@ -251,14 +248,14 @@ class _SampledImperfections:
         scene = replace_values(scene, objects=tuple(objects))
         if isinstance(motion, Platform):
             # Platforms draw their own errors.
-            return _with_motion(scene, errors_seed=int(rng.integers(2**31)))
+            return _change_motion(scene, errors_seed=int(rng.integers(2**31)))
         positions = np.array([motion.start_mm + index * motion.step_mm for index in range(motion.count)])
         errors = self._lead * positions + size.stage_position_std_mm * rng.standard_normal(motion.count)
         angles = self._scan_angles
         if scene.target is not None:
             # The sensor is mounted again for each target.
             angles = size.stage_misalignment_std_deg * rng.standard_normal(2)
-        return _with_motion(
+        return _change_motion(
             scene,
             direction=_tilt_direction(motion.unit_direction(), angles),
             nominal_direction=motion.recorded_direction(),
@@ -345,12 +342,16 @@ def find_understated(campaign: Campaign, takes: Sequence[Take]) -> tuple[Underst
     the waist's distance have no key: residuals show them, or they change no position.
     """
     described, built = choose_sensors(campaign.sensor, campaign.as_built)
-    found = [*_of_hardware(campaign, described, built), *_of_media(campaign, takes, built), *_of_steps(campaign, takes)]
+    found = [
+        *_compare_hardware(campaign, described, built),
+        *_compare_media(campaign, takes, built),
+        *_compare_steps(campaign, takes),
+    ]
     # Stated values are rounded, as 2.9 K for a half width of 5 K.
     return tuple(each for each in dict.fromkeys(found) if each.deviation > 1.02 * each.expanded)
 
 
-def _of_hardware(campaign: Campaign, described: Sensor, built: Sensor) -> Iterator[Understated]:
+def _compare_hardware(campaign: Campaign, described: Sensor, built: Sensor) -> Iterator[Understated]:
     """Yield deviations of the sensor, those of the sensor as built included, and of stage and target."""
     drawn, stated, wavelength = campaign.imperfections, described.uncertainty, described.laser.wavelength_nm
     nominal, real = described.camera.window, built.camera.window
@@ -388,7 +389,7 @@ def _of_hardware(campaign: Campaign, described: Sensor, built: Sensor) -> Iterat
         yield _compare(quantity, key, abs(known) + _NORMAL * std, within)
 
 
-def _of_media(campaign: Campaign, takes: Sequence[Take], built: Sensor) -> Iterator[Understated]:
+def _compare_media(campaign: Campaign, takes: Sequence[Take], built: Sensor) -> Iterator[Understated]:
     """Yield deviations of the temperature, for the recorded media whose index follows from it."""
     half = campaign.imperfections.temperature_half_width_c
     for take in takes:
@@ -402,7 +403,7 @@ def _of_media(campaign: Campaign, takes: Sequence[Take], built: Sensor) -> Itera
             yield _compare(changed, "drift_k", _DIFFERENCE * half, stated.drift_k)
 
 
-def _of_steps(campaign: Campaign, takes: Sequence[Take]) -> Iterator[Understated]:
+def _compare_steps(campaign: Campaign, takes: Sequence[Take]) -> Iterator[Understated]:
     """Yield deviations of step standards from their certificates, or from the sensor's statement without one."""
     for take in takes:
         artefact = None if take.scene.artefact is None else parse_artefact(take.scene.artefact)

@@ -64,7 +64,7 @@ class Block(FlatObject):
     edge_radius_mm: NotNegative = 0.0
 
     @model_validator(mode="after")
-    def _is_round_at_its_edges_only(self) -> Self:
+    def _check_edges(self) -> Self:
         if self.edge_radius_mm == 0:
             return self
         if 2 * self.edge_radius_mm >= min(self.size_mm):
@@ -150,7 +150,7 @@ class CirclePlate(PrintedPlate):
     marker_reflectance: Reflectance = 0.05
 
     @model_validator(mode="after")
-    def _shows_a_target(self) -> Self:
+    def _check_target(self) -> Self:
         self.described_target()
         return self
 
@@ -247,7 +247,7 @@ class Scene(Description):
 
     @model_validator(mode="before")
     @classmethod
-    def _targets_described(cls, table: object) -> object:
+    def _fill_targets(cls, table: object) -> object:
         """Use the scene's target for each target_plate without a description."""
         if not isinstance(table, dict) or table.get("target") is None or not isinstance(table.get("objects"), list):
             return table
@@ -258,7 +258,7 @@ class Scene(Description):
         return table | {"objects": objects}
 
     @model_validator(mode="after")
-    def _has_its_placement_and_one_target_with_detection_errors(self) -> "Scene":
+    def _check_placement_and_targets(self) -> "Scene":
         if self.placement not in self.placements:
             raise ValueError(f"placement '{self.placement}' is not one of {', '.join(self.placements)}")
         plates = [thing for thing in self.objects if isinstance(thing, PrintedPlate)]
@@ -295,7 +295,10 @@ def load_scene(
         raise DescriptionError(f"{path}: objects must be written as [[objects]] tables")
     if isinstance(moved := table.get("motion"), Mapping) and isinstance(moved.get("trajectory"), str):
         table["motion"] = {**moved, "trajectory": str(path.parent / str(moved["trajectory"]))}
-    table["objects"] = [_with_paths_from(path.parent, thing) for thing in objects]
+    table["objects"] = [
+        thing | {key: str(path.parent / thing[key]) for key in ("path", "texture") if isinstance(thing.get(key), str)}
+        for thing in objects
+    ]
     return validate_description(Scene, table, path)
 
 
@@ -307,12 +310,6 @@ def medium_of(sensor: Sensor, scene: Scene) -> Medium:
     kind = {"water": scene.water} if isinstance(scene.water, str) else {"turbidity": scene.water}
     kept = medium.model_dump(include={"kind", "temperature_c", "salinity_g_kg", "index"})
     return validate_description(Medium, kept | kind, f"{scene.title}, water = {scene.water!r}")
-
-
-def _with_paths_from(folder: Path, thing: Table) -> Table:
-    """Return an object's table with relative paths of mesh and texture resolved from a folder."""
-    paths = {key: thing.get(key) for key in ("path", "texture")}
-    return thing | {key: str(folder / path) for key, path in paths.items() if isinstance(path, str)}
 
 
 Value = float | int | str | bool

@@ -90,12 +90,12 @@ def finish_bsdf(
     to the object at its ``pose`` (4, 4) in the scene, by default the identity. DescriptionError if the texture is
     missing, unreadable, or has values outside 0 to 1; RangeError if the wavelength is outside the table of iron.
     """
-    own, scale = thing.finish_properties(), 1.0
-    field = _random_field(own, np.eye(4) if pose is None else pose, seed)
-    if gloss and own.reflection != "diffuse":
+    finish, scale = thing.finish_properties(), 1.0
+    field = _random_field(finish, np.eye(4) if pose is None else pose, seed)
+    if gloss and finish.reflection != "diffuse":
         reflectance = _reflectance(thing, scale, field)
         return _make_glossy(thing, reflectance, medium_index=medium_index, wavelength_nm=wavelength_nm)
-    if own.reflection == "metal":
+    if finish.reflection == "metal":
         index = iron_index(wavelength_nm=wavelength_nm) / medium_index
         scale = abs((index - 1) / (index + 1)) ** 2
     return mi.load_dict({"type": "diffuse", "reflectance": _reflectance(thing, scale, field)})
@@ -105,25 +105,25 @@ def _make_glossy(
     thing: SceneObject, reflectance: float | mi.Texture, *, medium_index: float, wavelength_nm: float
 ) -> mi.BSDF:
     """Return the BSDF of a metal or coated body; indices are relative to the surrounding medium."""
-    own = thing.finish_properties()
-    rough = {"distribution": "ggx", "alpha": own.alpha}
-    if own.reflection == "metal":
+    finish = thing.finish_properties()
+    rough = {"distribution": "ggx", "alpha": finish.alpha}
+    if finish.reflection == "metal":
         index = iron_index(wavelength_nm=wavelength_nm) / medium_index
         metal = {"type": "roughconductor", "eta": index.real, "k": index.imag, "sample_visible": True}
         return mi.load_dict(metal | rough | {"specular_reflectance": reflectance})
-    coat = {"type": "roughplastic", "int_ior": COAT_INDEX[own.reflection], "ext_ior": medium_index, "nonlinear": False}
-    return mi.load_dict(coat | rough | {"diffuse_reflectance": reflectance})
+    coat = {"type": "roughplastic", "int_ior": COAT_INDEX[finish.reflection], "ext_ior": medium_index}
+    return mi.load_dict(coat | rough | {"nonlinear": False, "diffuse_reflectance": reflectance})
 
 
-def _random_field(own: FinishProperties, pose: np.ndarray, seed: Sequence[int]) -> dict[str, object]:
+def _random_field(finish: FinishProperties, pose: np.ndarray, seed: Sequence[int]) -> dict[str, object]:
     """Return the waves of mottle and patches in the scene, and the level of the patches; empty if there are none."""
     field: dict[str, object] = {}
-    if own.mottle > 0 and own.reflectance > 0:
-        waves = draw_waves(np.random.default_rng([*seed, 0]), own.mottle_mm)
+    if finish.mottle > 0 and finish.reflectance > 0:
+        waves = draw_waves(np.random.default_rng([*seed, 0]), finish.mottle_mm)
         field["mottle_waves"] = move_waves(waves, pose).tolist()
-    if own.patch_share > 0:
+    if finish.patch_share > 0:
         waves, level = draw_patches(
-            np.random.default_rng([*seed, 1]), share=own.patch_share, length_mm=own.patch_length_mm
+            np.random.default_rng([*seed, 1]), share=finish.patch_share, length_mm=finish.patch_length_mm
         )
         field |= {"patch_waves": move_waves(waves, pose).tolist(), "level": level}
     return field
@@ -136,19 +136,19 @@ def _reflectance(thing: SceneObject, scale: float, field: dict[str, object]) -> 
     """
     if isinstance(thing, PrintedPlate):
         return pattern_texture(thing, scale)
-    own = thing.finish_properties()
+    finish = thing.finish_properties()
     if field:
         numbers = {
-            "mean": own.reflectance,
-            "mottle": own.mottle,
-            "patch": own.patch_reflectance,
-            "share": own.patch_share,
+            "mean": finish.reflectance,
+            "mottle": finish.mottle,
+            "patch": finish.patch_reflectance,
+            "share": finish.patch_share,
         }
         return mi.load_dict({"type": "random_reflectance", "table": json.dumps(field | numbers | {"scale": scale})})
     if thing.texture is None:
-        return scale * own.reflectance
+        return scale * finish.reflectance
     # Texture coordinate v starts at the last row of the picture, but Mitsuba's rows start at the first.
-    grey = scale * own.reflectance * read_grey(thing.texture)[::-1]
+    grey = scale * finish.reflectance * read_grey(thing.texture)[::-1]
     picture = mi.Bitmap(np.ascontiguousarray(grey[..., None], dtype=np.float32))
     wrap_mode = "clamp" if isinstance(thing, FlatObject) else "repeat"
     return mi.load_dict({"type": "bitmap", "bitmap": picture, "raw": True, "wrap_mode": wrap_mode})
@@ -206,11 +206,11 @@ def albedo_parts(
 
 def body_spread(thing: SceneObject, *, medium_index: float) -> LateralSpread:
     """Return the lateral spread of light in an object's body in a medium."""
-    own = thing.finish_properties()
+    finish = thing.finish_properties()
     return lateral_spread(
-        mean_free_path_mm=own.mean_free_path_mm,
-        reflectance=own.reflectance,
-        index=COAT_INDEX.get(own.reflection, medium_index) / medium_index,
+        mean_free_path_mm=finish.mean_free_path_mm,
+        reflectance=finish.reflectance,
+        index=COAT_INDEX.get(finish.reflection, medium_index) / medium_index,
     )
 
 

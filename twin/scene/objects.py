@@ -185,7 +185,7 @@ def build_objects(
         retroreflects=any(thing.retroreflection > 0 for thing in things),
         translucent=any(spread.path_mm > 0 for spread in spreads),
         mirrors=tuple(face for thing, pose in placed if gloss for face in _mirror_faces(thing, pose)),
-        _facts={key: _by_registry(shapes, np.array(values, float)) for key, values in facts.items()},
+        _facts={key: _arrange_by_registry(shapes, np.array(values, float)) for key, values in facts.items()},
     )
 
 
@@ -194,7 +194,7 @@ def _registry_number(shape: mi.ShapePtr) -> UInt32:
     return cast(Any, dr.reinterpret_array(mi.UInt32, shape))
 
 
-def _by_registry(shapes: list[mi.Shape], values: np.ndarray) -> Float:
+def _arrange_by_registry(shapes: list[mi.Shape], values: np.ndarray) -> Float:
     """Arrange values (objects,) or (objects, N) by the shapes' numbers in Dr.Jit's registry."""
     number = [int(_registry_number(mi.ShapePtr(shape))[0]) for shape in shapes]
     table = np.zeros((max(number) + 1, *values.shape[1:]), np.float32)

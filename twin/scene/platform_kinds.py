@@ -205,7 +205,7 @@ class LinearGuide(Route):
     pitch_mm: Positive = 5.0
 
     @model_validator(mode="after")
-    def _is_straight(self) -> "LinearGuide":
+    def _check_straight(self) -> "LinearGuide":
         places = np.array([waypoint.position_mm for waypoint in self.waypoints])
         if len(places) < 2 or np.linalg.norm(places[-1] - places[0]) < SPOT_MM:
             raise ValueError("a linear guide needs two or more waypoints; the last must differ from the first")
@@ -218,7 +218,7 @@ class LinearGuide(Route):
         guide = _axes((last - first) / travel)
         ranges = np.array([self.positioning_um, *self.straightness_um]) * 1e-3
         turns = np.radians(np.array([self.roll_arcsec, self.pitch_arcsec, self.yaw_arcsec]) / 3600)
-        bends = [_bend(size, rng) for size in (*ranges, *turns)]
+        bends = [_draw_bend(size, rng) for size in (*ranges, *turns)]
         begun, phase = commanded(np.zeros(1))[0, :3, 3], rng.uniform(0, 2 * np.pi)
 
         def true(times: np.ndarray) -> np.ndarray:
@@ -307,7 +307,7 @@ def _axes(along: np.ndarray) -> np.ndarray:
     return np.column_stack([along, across, np.cross(along, across)])
 
 
-def _bend(size: float, rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
+def _draw_bend(size: float, rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
     """Return an error motion over the travelled fraction, 0 to 1, with a given range.
 
     It consists of waves of 1 to 4 periods with amplitudes that decrease as 1/n.

@@ -43,7 +43,7 @@ class Motion(Description):
     speed_mm_per_s: NotNegative = 0.0
 
     @model_validator(mode="after")
-    def _has_direction(self) -> "Motion":
+    def _check_direction(self) -> "Motion":
         for vector in (self.direction, self.nominal_direction):
             if vector is not None and np.linalg.norm(vector) < 1e-9:
                 raise ValueError(f"direction {vector} has no length")
@@ -194,7 +194,7 @@ class Platform(Description, ABC):
         """Return the motion of the platform, with errors drawn from a generator."""
 
     @model_validator(mode="after")
-    def _takes_images(self) -> "Platform":
+    def _check_images(self) -> "Platform":
         if not self.lights:
             raise ValueError("lights is empty: name 'lamp', 'laser' or both")
         if not self.moves() and self.frame_rate_hz is not None:
@@ -259,8 +259,8 @@ class Platform(Description, ABC):
         reported, covariance = self._report_poses(motion, times - self.clock_offset_s, rng)
         report = None
         if self.moves():
-            own = np.arange(-LEAD_S, times[-1] + LEAD_S, 1 / self.report_hz)
-            report = (own + self.clock_offset_s, *self._report_poses(motion, own, rng))
+            times_s = np.arange(-LEAD_S, times[-1] + LEAD_S, 1 / self.report_hz)
+            report = (times_s + self.clock_offset_s, *self._report_poses(motion, times_s, rng))
         return Course(shots, sensor, reported, covariance, report)
 
     def _report_poses(
@@ -295,7 +295,7 @@ class Route(Platform):
     turn_deg_per_s: Positive = 30.0
 
     @model_validator(mode="after")
-    def _has_a_path(self) -> "Route":
+    def _check_path(self) -> "Route":
         if bool(self.waypoints) == (self.trajectory is not None):
             raise ValueError("give either waypoints or a trajectory")
         if self.speed_mm_per_s > 0 and len(self.waypoints) < 2:

@@ -74,23 +74,23 @@ class SceneObject(Pose):
     """Reason why the reflectance of objects of a class does not vary."""
 
     @model_validator(mode="after")
-    def _has_what_its_finish_and_shape_take(self) -> Self:
-        own = self.finish_properties()
+    def _check_finish(self) -> Self:
+        finish = self.finish_properties()
         if self.texture is not None and self._no_texture:
             raise ValueError(f"texture {self.texture} {self._no_texture}")
-        if own.reflection == "diffuse" and self.alpha is not None:
+        if finish.reflection == "diffuse" and self.alpha is not None:
             raise ValueError(f"alpha {self.alpha:g} is for glossy finishes, but finish is '{self.finish}': omit alpha")
         for name in ("mottle", "patch_share"):
-            value = getattr(own, name)
+            value = getattr(finish, name)
             if value > 0 and self._no_mottle:
                 raise ValueError(f"{name} {value:g} of the finish '{self.finish}' {self._no_mottle} {name} = 0")
             if value > 0 and self.texture is not None:
                 raise ValueError(f"texture {self.texture} and {name} {value:g}: use one of them, or {name} = 0")
-        if own.mean_free_path_mm > 0 and own.reflection == "metal":
-            raise ValueError(f"mean_free_path_mm {own.mean_free_path_mm:g} in a metal: light does not enter it")
-        if (lost := clipped_share(own.reflectance, own.mottle)) > LARGEST_CLIPPED:
+        if finish.mean_free_path_mm > 0 and finish.reflection == "metal":
+            raise ValueError(f"mean_free_path_mm {finish.mean_free_path_mm:g} in a metal: light does not enter it")
+        if (lost := clipped_share(finish.reflectance, finish.mottle)) > LARGEST_CLIPPED:
             raise ValueError(
-                f"reflectance {own.reflectance:g} with mottle {own.mottle:g} would often exceed 1, and lose "
+                f"reflectance {finish.reflectance:g} with mottle {finish.mottle:g} would often exceed 1, and lose "
                 f"{100 * lost:.1f} % of its mean: reduce one of them"
             )
         return self
@@ -124,12 +124,12 @@ class FlatObject(SceneObject):
     mirror: Reflectance = 0.0
 
     @model_validator(mode="after")
-    def _reflects_at_most_all(self) -> "FlatObject":
-        own = self.finish_properties()
-        if own.reflectance + self.mirror > 1:
-            both = f"reflectance {own.reflectance:g} and mirror {self.mirror:g}"
+    def _check_reflectances(self) -> "FlatObject":
+        finish = self.finish_properties()
+        if finish.reflectance + self.mirror > 1:
+            both = f"reflectance {finish.reflectance:g} and mirror {self.mirror:g}"
             raise ValueError(f"{both} add up to more than 1: reduce one of them")
-        if self.mirror > 0 and own.reflection in ("painted", "pvc"):
+        if self.mirror > 0 and finish.reflection in ("painted", "pvc"):
             raise ValueError(f"mirror {self.mirror:g} under a coat: use the finish 'diffuse' or 'metal' for a mirror")
         return self
 

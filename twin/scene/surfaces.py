@@ -211,17 +211,17 @@ def lateral_spread(*, mean_free_path_mm: float, reflectance: float, index: float
     inwards = internal_reflectance(index)
     leaving = min(reflectance * (1 - inwards) / (1 - reflectance * inwards), 1 - 1e-6)
     # In units of the mean free path.
-    apart = 4 / 3 * (1 + inwards) / (1 - inwards)
+    boundary = 4 / 3 * (1 + inwards) / (1 - inwards)
 
     def excess(decay: float) -> float:
-        return (1 - decay**2 / 3) * (1 + math.exp(-apart * decay)) / (2 + 2 * decay) - leaving
+        return (1 - decay**2 / 3) * (1 + math.exp(-boundary * decay)) / (2 + 2 * decay) - leaving
 
     decay = root_scalar(excess, bracket=(0, math.sqrt(3))).root
     depth, share = np.polynomial.laguerre.laggauss(_DEPTHS)
-    variance = np.geomspace(1e-5, 1e3 * apart / max(decay, 1e-3), 4000)
+    variance = np.geomspace(1e-5, 1e3 * boundary / max(decay, 1e-3), 4000)
     # Per logarithm of the variance.
     density = np.exp(-0.5 * decay**2 * variance) / np.sqrt(variance)
-    density *= sum(z * np.exp(-0.5 * z**2 / variance[:, None]) @ share for z in (depth, depth + apart))
+    density *= sum(z * np.exp(-0.5 * z**2 / variance[:, None]) @ share for z in (depth, depth + boundary))
     below = np.cumsum(density) / density.sum()
     low, high = np.interp(_TAILS, below, np.log(variance))
     edges = np.linspace(low, high, GAUSSIANS + 1)[1:-1]

@@ -43,7 +43,7 @@ def poisson_numbers(mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """
     flat = np.ascontiguousarray(mean).ravel()
     numbers = np.empty(flat.shape, np.float32)
-    _small_poisson_numbers(flat, *_poisson_tables(), _start(rng), rng.poisson(POISSON_STEP * flat.size), numbers)
+    _fill_small_poisson(flat, *_poisson_tables(), _start(rng), rng.poisson(POISSON_STEP * flat.size), numbers)
     large = np.flatnonzero(flat >= LARGEST_MEAN)
     numbers[large] = rng.poisson(flat[large])
     return numbers.reshape(mean.shape)
@@ -91,7 +91,7 @@ def _uniform(state: np.uint64) -> float:
 
 
 @compiled
-def _small_poisson_numbers(
+def _fill_small_poisson(
     mean: np.ndarray,
     count_of_cell: np.ndarray,
     distribution: np.ndarray,
@@ -110,11 +110,11 @@ def _small_poisson_numbers(
             numbers[i] = 0
             continue
         level = np.int64(mean[i] / step)
-        own = _advance(state, 2 * i)
-        cell = np.int64(_mix(own) >> np.uint64(52))
+        stream = _advance(state, 2 * i)
+        cell = np.int64(_mix(stream) >> np.uint64(52))
         count = np.int64(count_of_cell[level, cell])
         if count == _SEVERAL:
-            uniform = (cell + _uniform(_next(own))) / _CELLS
+            uniform = (cell + _uniform(_next(stream))) / _CELLS
             count = 0
             while distribution[level, count] <= uniform:
                 count += 1

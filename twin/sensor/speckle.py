@@ -86,7 +86,7 @@ class Speckle:
         self.renewal_mm = _RENEWAL_CELLS * grain_mm / magnification
         self._seed = seed
         self._along_width = camera.stripe_along == "width"
-        self._pixel = pixel_contrast(grain_px) ** 2, _third_of_pixel(grain_px)
+        self._pixel = pixel_contrast(grain_px) ** 2, _compute_third_cumulant(grain_px)
         self._tile = _Tile(camera.lines(), grain_px)
 
     def factors(
@@ -173,9 +173,9 @@ class _Tile:
 
     def __init__(self, along_px: int, grain_px: float) -> None:
         least = math.ceil(_TILE_GRAINS * grain_px)
-        apart = math.ceil(2 * grain_px)  # keeps the ends of the stripe uncorrelated, as the tile is periodic
+        gap = math.ceil(2 * grain_px)  # keeps the ends of the stripe uncorrelated, as the tile is periodic
         self.across_px = cast(int, fft.next_fast_len(max(_TILE_PX, least)))
-        along_px = cast(int, fft.next_fast_len(max(along_px + apart, least)))
+        along_px = cast(int, fft.next_fast_len(max(along_px + gap, least)))
         if grain_px <= _FINE_PX:
             power = _power_of_sums(self.across_px, along_px, grain_px)
         else:
@@ -206,7 +206,7 @@ def _power_of_sums(across_px: int, along_px: int, grain_px: float) -> np.ndarray
     # By Mehler's formula for exponential variables (Laguerre polynomials), the n-th term of their transform is
     # correlated by the n-th power of their correlation.
     nodes, weights = np.polynomial.laguerre.laggauss(48)
-    shaped = _skew_exponential(nodes, _third_of_pixel(grain_px) / pixel_contrast(grain_px) ** 3)
+    shaped = _skew_exponential(nodes, _compute_third_cumulant(grain_px) / pixel_contrast(grain_px) ** 3)
     terms = np.square((weights * shaped) @ np.polynomial.laguerre.lagvander(nodes, 12))[1:]
     drawn = np.linspace(0, 1, 1001)
     reshaped = np.polynomial.polynomial.polyval(drawn, np.concatenate([[0.0], terms / terms.sum()]))
@@ -238,7 +238,7 @@ def _correlation_of_sums(grain_px: float) -> np.ndarray:
 
 
 @cache
-def _third_of_pixel(grain_px: float) -> float:
+def _compute_third_cumulant(grain_px: float) -> float:
     """Return half the third cumulant of a coherent, polarised pattern averaged over square pixels.
 
     It is the mean, over triples of points of the pixel, of the product of 2 J1(z) / z for their three pairs; see

@@ -76,9 +76,11 @@ def check_requirements(
         planned["F"] += isinstance(standard, PlaneStandard)
 
     def count(clause: str, least: int, symbol: Symbol) -> Requirement:
-        own = [each for each in values if each.symbol == symbol]
-        different = count_different(own, diagonal)
-        done = f"{len(own)} of {planned[symbol]} planned" + (f", {different} differ" if different < len(own) else "")
+        those = [each for each in values if each.symbol == symbol]
+        different = count_different(those, diagonal)
+        done = f"{len(those)} of {planned[symbol]} planned" + (
+            f", {different} differ" if different < len(those) else ""
+        )
         return Requirement(clause=clause, required=f"at least {least}", done=done, met=different >= least)
 
     diameters = [size for each in spheres for size in each.diameters_mm]
@@ -198,7 +200,7 @@ class Acceptance(Brief, StoredResult):
     edited: bool = False
 
     @model_validator(mode="after")
-    def _names_fit(self) -> "Acceptance":
+    def _check_names(self) -> "Acceptance":
         for each in self.positions:
             if each.artefact not in self.plan.artefacts:
                 raise ValueError(
@@ -245,16 +247,16 @@ class Acceptance(Brief, StoredResult):
 
 def format_characteristic(each: Characteristic) -> str:
     """Return a characteristic as one line of text."""
-    words, _ = NAMES[each.symbol]
+    text, _ = NAMES[each.symbol]
     limit = f"MPE {each.limit_text()} mm" if each.limit_text() else "no MPE stated"
     if each.worst is None:
-        return f"{each.symbol:5} {words}: not measured, {limit}"
+        return f"{each.symbol:5} {text}: not measured, {limit}"
     u = "U not known" if each.worst.expanded_mm is None else f"U {each.worst.expanded_mm:.4f} mm"
     where = f"{each.worst.position}, {each.worst.label}"
     sign = "" if each.symbol in ("PF", "PF95", "F", "F95") else "+"
     chance = f", probability of conformity {each.probability_text()}" if each.probability is not None else ""
     return (
-        f"{each.symbol:5} {words}: {each.worst.value_mm:{sign}.4f} mm ({where}; {each.count} measured), {u}, {limit}"
+        f"{each.symbol:5} {text}: {each.worst.value_mm:{sign}.4f} mm ({where}; {each.count} measured), {u}, {limit}"
         f"{chance}: {each.decision_text()}"
     )
 

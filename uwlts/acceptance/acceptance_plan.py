@@ -50,7 +50,7 @@ class PermissibleErrors(Description):
     E_mm_per_m: Spread = 0.0
 
     @model_validator(mode="after")
-    def _has_constant_parts(self) -> "PermissibleErrors":
+    def _check_parts(self) -> "PermissibleErrors":
         for symbol in ("SD", "E"):
             if getattr(self, f"{symbol}_mm_per_m") and getattr(self, f"{symbol}_mm") is None:
                 raise ValueError(f"{symbol}_mm_per_m needs {symbol}_mm, the limit for short lengths")
@@ -95,7 +95,7 @@ class CertifiedArtefact(Description):
     margin_mm: Size | None = None
 
     @model_validator(mode="after")
-    def _is_of_a_test(self) -> "CertifiedArtefact":
+    def _check_kind(self) -> "CertifiedArtefact":
         if isinstance(self.standard, PipeStandard):
             raise ValueError("a pipe is no artefact of an acceptance test; give spheres, a plane or a step")
         return self
@@ -144,7 +144,7 @@ class PlannedPosition(Description):
     region_mm: tuple[Interval, Interval, Interval] | None = None
 
     @model_validator(mode="after")
-    def _region_is_open(self) -> "PlannedPosition":
+    def _check_region(self) -> "PlannedPosition":
         for axis, (low, high) in zip("XYZ", self.region_mm or (), strict=False):
             if low >= high:
                 raise ValueError(f"region_mm: the interval of {axis} is {low:g} to {high:g}; expected an increase")
@@ -185,7 +185,7 @@ class AcceptancePlan(Description):
     positions: tuple[PlannedPosition, ...] = Field(min_length=1)
 
     @model_validator(mode="after")
-    def _names_fit(self) -> "AcceptancePlan":
+    def _check_names(self) -> "AcceptancePlan":
         names, files = [each.name for each in self.positions], [each.file for each in self.positions]
         for listed, what in ((names, "name"), (files, "file")):
             if twice := sorted({each for each in listed if listed.count(each) > 1}):

@@ -76,20 +76,20 @@ def measure_spheres(points: np.ndarray, standard: SphereStandard, *, margin_mm: 
     EvaluationError if a sphere is missing, or more than 0.3 % of its points are farther than the margin from it.
     """
     found = evaluate_spheres(points, standard).spheres
-    away = points[:, None] - np.array([sphere.centre_mm for sphere in found])
-    distance = np.linalg.norm(away, axis=2)
+    offsets = points[:, None] - np.array([sphere.centre_mm for sphere in found])
+    distance = np.linalg.norm(offsets, axis=2)
     off = distance - np.array([sphere.diameter_mm / 2 for sphere in found])
     nearest = np.argmin(np.abs(off), axis=1)
     cap = np.radians(standard.cap_angle_deg or _HEMISPHERE_DEG)
-    toward = away @ TOWARDS_SENSOR
+    toward = offsets @ TOWARDS_SENSOR
     facing = toward >= np.cos(cap) * distance
     aside = np.sqrt(np.maximum(distance**2 - toward**2, 0.0))
     measured = []
     for number, sphere in enumerate(found):
         before = aside[:, number] <= np.sin(cap) * sphere.diameter_mm / 2
-        own = (nearest == number) & facing[:, number] & (before | (np.abs(off[:, number]) <= margin_mm))
+        members = (nearest == number) & facing[:, number] & (before | (np.abs(off[:, number]) <= margin_mm))
         name = f"sphere {number + 1}"
-        measured.append(_fit_kept(Sphere.fit, points[own], off[own, number], margin_mm=margin_mm, name=name))
+        measured.append(_fit_kept(Sphere.fit, points[members], off[members, number], margin_mm=margin_mm, name=name))
     return measured
 
 
@@ -337,25 +337,25 @@ def judge_characteristic(
     rule: DecisionRule = "U",
 ) -> Characteristic:
     """Return a characteristic with its worst value and the decision; for the limits see `Characteristic`."""
-    own = [each for each in values if each.symbol == symbol]
-    stated = {"symbol": symbol, "count": len(own), "mpe_mm": mpe_mm, "mpe_mm_per_m": mpe_mm_per_m}
+    matching = [each for each in values if each.symbol == symbol]
+    stated = {"symbol": symbol, "count": len(matching), "mpe_mm": mpe_mm, "mpe_mm_per_m": mpe_mm_per_m}
     limit_of = Characteristic(**stated, worst=None, decision="undecided").limit_mm
-    limits = [limit_of(each) for each in own]
+    limits = [limit_of(each) for each in matching]
     guard = _GUARDS[rule] / COVERAGE_FACTOR
     beyond = [
         abs(each.value_mm) + guard * (each.expanded_mm or 0.0) - (limit or 0.0)
-        for each, limit in zip(own, limits, strict=True)
+        for each, limit in zip(matching, limits, strict=True)
     ]
-    judged = [_decide(each, limit, rule) for each, limit in zip(own, limits, strict=True)]
-    if not own:
+    judged = [_decide(each, limit, rule) for each, limit in zip(matching, limits, strict=True)]
+    if not matching:
         judged: list[tuple[Decision, str]] = [("no MPE", "") if mpe_mm is None else ("undecided", "not measured")]
     order = get_args(Decision)
     decision, reason = min(judged, key=lambda each: order.index(each[0]))
-    chances = [_probability(each, limit) for each, limit in zip(own, limits, strict=True)]
+    chances = [_probability(each, limit) for each, limit in zip(matching, limits, strict=True)]
     known = [chance for chance in chances if chance is not None]
     return Characteristic(
         **stated,
-        worst=own[int(np.argmax(beyond))] if own else None,
+        worst=matching[int(np.argmax(beyond))] if matching else None,
         decision=decision,
         reason=reason,
         probability=min(known) if known and len(known) == len(chances) else None,

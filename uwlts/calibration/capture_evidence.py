@@ -48,11 +48,11 @@ class AirEvidence:
         """Return lines on the images, the worst first; ``off_px`` lists the scatter of points and stripe by name."""
         rows = [*zip(self.names(), self.images, self.stripes, strict=True)]
         rows.sort(key=lambda row: -max(off_px.get(row[0], (0.0,))))
-        said = [f"{'image':<32}{'stage, mm':>10}{'points':>8}{'stripe':>8}  scatter of both, px"]
+        lines = [f"{'image':<32}{'stage, mm':>10}{'points':>8}{'stripe':>8}  scatter of both, px"]
         for name, image, stripe in rows[:_MOST_ROWS]:
             off = ", ".join(f"{each:.2f}" for each in off_px.get(name, ()))
-            said.append(f"{name:<32}{image.stage_mm:>10g}{len(image.pixels):>8}{len(stripe):>8}  {off or '-'}")
-        return "\n".join(["", *said, *([f"and {len(rows) - _MOST_ROWS} more"] if len(rows) > _MOST_ROWS else [])])
+            lines.append(f"{name:<32}{image.stage_mm:>10g}{len(image.pixels):>8}{len(stripe):>8}  {off or '-'}")
+        return "\n".join(["", *lines, *([f"and {len(rows) - _MOST_ROWS} more"] if len(rows) > _MOST_ROWS else [])])
 
     def only(self, chosen: np.ndarray, images: list[TargetImage]) -> "AirEvidence":
         """Return the chosen images, with their points replaced."""

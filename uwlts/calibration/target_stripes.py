@@ -43,8 +43,8 @@ def stripe_on_target(
     Parameters and errors are those of `extract_stripe`.
     """
     stripe = find_stripe(seen, stripe_along=stripe_along, saturation=saturation, options=options)
-    to_plate, pixels = _to_plate(view), stripe.pixels()
-    on_plate = _on_plate(pixels, to_plate, target)
+    to_plate, pixels = _find_homography(view), stripe.pixels()
+    on_plate = _mask_plate(pixels, to_plate, target)
     lines = stripe.lines[on_plate]
     across = stripe.centre_px[lines]
     if len(lines) < _FEWEST:
@@ -56,13 +56,13 @@ def stripe_on_target(
         return TargetStripe(np.empty((0, 2)), len(lines))
     near = curve.holds(lines, across)
     along_curve = np.arange(len(stripe.status))
-    expected = _on_plate(_pixels(along_curve, curve.polynomial(along_curve), stripe_along), to_plate, target)
+    expected = _mask_plate(_pixels(along_curve, curve.polynomial(along_curve), stripe_along), to_plate, target)
     missing = np.setdiff1d(along_curve[expected], lines[near])
     outliers = int(np.count_nonzero(~near))
     lines, across = lines[near], across[near]
     if isinstance(seen, np.ndarray) and len(missing) > _LOST * np.count_nonzero(expected):
         width = float(np.median(stripe.width_px[lines]))
-        more_lines, more_across = _near_curve(seen, curve, missing, stripe_along, saturation, options, width)
+        more_lines, more_across = _find_near_curve(seen, curve, missing, stripe_along, saturation, options, width)
         lines, across = np.concatenate([lines, more_lines]), np.concatenate([across, more_across])
         curve = curve.refine(lines, across)
         near = curve.holds(lines, across)
@@ -76,13 +76,13 @@ def _pixels(lines: np.ndarray, across: np.ndarray, stripe_along: str) -> np.ndar
     return np.column_stack((across, lines) if stripe_along == "height" else (lines, across)).astype(np.float64)
 
 
-def _to_plate(view: TargetView) -> np.ndarray:
+def _find_homography(view: TargetView) -> np.ndarray:
     """Return the homography (3, 3) from pixels to the target's plane; its third coordinate is positive on the plate."""
     inverse = np.linalg.inv(cv2.findHomography(view.points_mm[:, :2], view.pixels)[0])
     return inverse * np.sign(inverse[2] @ [*view.pixels[0], 1.0])
 
 
-def _on_plate(pixels: np.ndarray, to_plate: np.ndarray, target: Target) -> np.ndarray:
+def _mask_plate(pixels: np.ndarray, to_plate: np.ndarray, target: Target) -> np.ndarray:
     """Return a mask (N,) of pixels (N, 2) on a target's plate, or slightly outside."""
     seen = np.column_stack([pixels, np.ones(len(pixels))]) @ to_plate.T
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -105,8 +105,8 @@ class _Curve:
         powers = ((lines - middle) / half)[:, None] ** np.arange(3)
         chosen = np.sort(np.random.default_rng(0).integers(len(lines), size=(_TRIALS, 3)), axis=1)
         # Three different lines determine one parabola.
-        apart = np.diff(lines[chosen], axis=1)
-        chosen = chosen[(apart != 0).all(axis=1) & (np.ptp(lines[chosen], axis=1) >= 0.1 * half)]
+        spacing = np.diff(lines[chosen], axis=1)
+        chosen = chosen[(spacing != 0).all(axis=1) & (np.ptp(lines[chosen], axis=1) >= 0.1 * half)]
         if not len(chosen):
             return None
         parabolas = np.linalg.solve(powers[chosen], across[chosen][:, :, None])[:, :, 0]
@@ -122,8 +122,8 @@ class _Curve:
         curve, near = self, self.holds(lines, across)
         for _ in range(10):
             polynomial = np.polynomial.Polynomial.fit(lines[near], across[near], _DEGREE)
-            apart = np.abs(across[near] - polynomial(lines[near]))
-            limit = max(DEFAULT_K * MAD_TO_STD * float(np.median(apart)), _LEAST_LIMIT_PX)
+            deviation = np.abs(across[near] - polynomial(lines[near]))
+            limit = max(DEFAULT_K * MAD_TO_STD * float(np.median(deviation)), _LEAST_LIMIT_PX)
             curve = _Curve(polynomial, limit)
             before, near = near, curve.holds(lines, across)
             if (near == before).all():
@@ -135,7 +135,7 @@ class _Curve:
         return np.abs(across - self.polynomial(lines)) <= self.limit_px
 
 
-def _near_curve(
+def _find_near_curve(
     image: np.ndarray,
     curve: _Curve,
     lines: np.ndarray,
@@ -180,17 +180,17 @@ def doubt_sheet_at_rest(
     for number, name in enumerate(names):
         if len(pixels[number]) > 1:
             captures.setdefault(name.rsplit(", frame ", 1)[0], []).append(number)
-    said = []
-    for own in captures.values():
-        places = np.array([np.median(pixels[number][:, across]) for number in own])
-        halves = [np.array_split(off[number][np.argsort(pixels[number][:, 1 - across])], 2) for number in own]
+    texts = []
+    for stripes in captures.values():
+        places = np.array([np.median(pixels[number][:, across]) for number in stripes])
+        halves = [np.array_split(off[number][np.argsort(pixels[number][:, 1 - across])], 2) for number in stripes]
         if (found := find_step(places, np.array([[np.median(half) for half in each] for each in halves]))) is not None:
             image, size = found
-            said.append(
-                f"{names[own[image]]}: the laser sheet moved by {size:.2g} {unit} before this image: fix the laser, "
-                "and calibrate from images before the move only, or from those after it only"
+            texts.append(
+                f"{names[stripes[image]]}: the laser sheet moved by {size:.2g} {unit} before this image: fix the "
+                "laser, and calibrate from images before the move only, or from those after it only"
             )
-    return said
+    return texts
 
 
 def find_step(places: np.ndarray, distances: np.ndarray) -> tuple[int, float] | None:

@@ -121,19 +121,19 @@ class SurfaceChange(Brief):
                 found.append(self._region(chosen[owner == number]))
         return sorted(found, key=lambda region: -abs(region.volume_mm3))
 
-    def _region(self, own: np.ndarray) -> ChangedRegion:
-        distance, area, points = self.distance_mm[own], self.area_mm2[own], self.points_mm[own]
+    def _region(self, members: np.ndarray) -> ChangedRegion:
+        distance, area, points = self.distance_mm[members], self.area_mm2[members], self.points_mm[members]
         # Scattered points without neighbours have no area.
         area = area if area.any() else np.ones_like(area)
         centre = np.average(points, axis=0, weights=area)
         extent = np.ptp((points - centre) @ np.linalg.svd(points - centre, full_matrices=False)[2][0])
         return ChangedRegion(
             (float(centre[0]), float(centre[1]), float(centre[2])),
-            len(own),
+            len(members),
             float(area.sum()),
             float(np.average(distance, weights=area)),
             float(distance[np.argmax(np.abs(distance))]),
-            float(np.median(self.level_mm[own])),
+            float(np.median(self.level_mm[members])),
             float(distance @ area),
             float(extent),
         )
@@ -288,7 +288,7 @@ def compare_clouds(
     disc = disc_mm or choose_disc_diameter(require_enough(new.points_mm, "cloud"), new.frame)
     surface = read_reference(reference, unit=reference_unit, disc_mm=disc)
     exact = not isinstance(surface, SurfaceSample) or surface.meshed or surface.uncertainty is not None
-    own, own_warnings = stated_variance(cloud_std_mm, known=new.uncertainty is not None, of="cloud")
+    cloud_variance, own_warnings = stated_variance(cloud_std_mm, known=new.uncertainty is not None, of="cloud")
     other, other_warnings = stated_variance(reference_std_mm, known=exact, of="reference")
     fixed = None if datums is None else read_datums(datums)
     if isinstance(surface, SurfaceSample):
@@ -309,7 +309,7 @@ def compare_clouds(
         variance = variance + found.std_along(sides.places, sides.normals) ** 2
     # Rounding errors of neighbouring points are equal where a surface is parallel to an axis, and do not average out.
     samples = [sample, surface] if isinstance(surface, SurfaceSample) else [sample]
-    variance = variance + sum(each.rounding_std_mm**2 for each in samples) + own + other
+    variance = variance + sum(each.rounding_std_mm**2 for each in samples) + cloud_variance + other
     if not np.isfinite(sides.distance_mm).any():
         raise EvaluationError(
             f"the cloud and the reference do not overlap within {deep:g} mm. Check that both have the same frame and "
@@ -360,10 +360,10 @@ def _compare_with_points(
     same_water: bool,
 ) -> _Distances:
     depths: float | np.ndarray = deep
-    chosen, apart = _thin_points(cloud.points_mm, disc / 2)
+    chosen, spacing = _thin_points(cloud.points_mm, disc / 2)
     if surface.normals is not None:
         seen, depths = select_seen_side(
-            cloud.points_mm[chosen], surface.points_mm, surface.normals, deep_mm=deep, apart_mm=apart
+            cloud.points_mm[chosen], surface.points_mm, surface.normals, deep_mm=deep, apart_mm=spacing
         )
         surface = replace(surface, points_mm=surface.points_mm[seen], normals=surface.normals[seen])
     found = register_to_surface(cloud, surface, reach_mm=deep, datums=datums) if register else None
@@ -385,8 +385,8 @@ def _compare_with_points(
             if same_water or not name.startswith(WATER):
                 ours, theirs = here.patterns_mm @ known.shared[name], there.patterns_mm @ other.shared[name]
                 variance -= 2 * np.sum(ours * theirs, axis=1)
-    words = "mesh" if surface.meshed else "cloud"
-    return _Distances(places, apart, normals, here.mean_mm - there.mean_mm, variance, found, found, words)
+    text = "mesh" if surface.meshed else "cloud"
+    return _Distances(places, spacing, normals, here.mean_mm - there.mean_mm, variance, found, found, text)
 
 
 def _compare_with_shape(
@@ -409,13 +409,13 @@ def _compare_with_shape(
         target = SurfaceSample(below[np.isfinite(distance)])
         found = moved = register_to_surface(cloud, target, reach_mm=deep, datums=datums)
         cloud = _move_cloud(cloud, found)
-    spread, apart = _thin_points(cloud.points_mm, disc / 2)
+    spread, spacing = _thin_points(cloud.points_mm, disc / 2)
     places = cloud.points_mm[spread]
     normals, distance = placed.nearest(places)[1], placed.nearest(cloud.points_mm, reach_mm=deep)[0]
     here = average_locally(places, normals, cloud, distance_mm=distance, disc_mm=disc, deep_mm=deep)
     variance = here.variance_mm2 + np.sum(here.patterns_mm**2, axis=1)
     reference = placed.describe() + placed.note_misfit(places, here.mean_mm, variance)
-    return _Distances(places, apart, normals, here.mean_mm, variance, found, moved, reference)
+    return _Distances(places, spacing, normals, here.mean_mm, variance, found, moved, reference)
 
 
 def _estimate_areas(places: np.ndarray) -> np.ndarray:
@@ -423,22 +423,22 @@ def _estimate_areas(places: np.ndarray) -> np.ndarray:
     count = min(OPTIONS.area_neighbours, len(places) - 1)
     if count < 1:
         return np.zeros(len(places))
-    away = np.asarray(KDTree(places).query(places, k=count + 1, workers=-1)[0])[:, -1]
-    return np.pi * away**2 / (count + 0.5)
+    distance = np.asarray(KDTree(places).query(places, k=count + 1, workers=-1)[0])[:, -1]
+    return np.pi * distance**2 / (count + 0.5)
 
 
-def _thin_points(points: np.ndarray, apart: float) -> tuple[np.ndarray, float]:
-    """Select one point in each cube of side ``apart``; return the indices and the side.
+def _thin_points(points: np.ndarray, spacing: float) -> tuple[np.ndarray, float]:
+    """Select one point in each cube of side ``spacing``; return the indices and the side.
 
     The side grows if there would be too many places.
     """
     while True:
-        cubes = number_cubes(points - points.min(axis=0), apart)
+        cubes = number_cubes(points - points.min(axis=0), spacing)
         first = np.sort(np.unique(cubes, return_index=True)[1])
         if len(first) <= OPTIONS.most_places:
-            return first, apart
+            return first, spacing
         # The number of cubes on a surface is inversely proportional to the square of their side.
-        apart *= max(np.sqrt(len(first) / OPTIONS.most_places), 1.02)
+        spacing *= max(np.sqrt(len(first) / OPTIONS.most_places), 1.02)
 
 
 def _move_cloud(cloud: SurfaceSample, found: Registration) -> SurfaceSample:

@@ -53,7 +53,7 @@ class _Shape(Description):
         return None if size is None else size / 2
 
     @model_validator(mode="after")
-    def _placed_or_not(self) -> Self:
+    def _check_placed(self) -> Self:
         given = getattr(self, self.way, None)
         if self.way and (self.point_mm is None) != (given is None):
             raise ValueError(f"give both point_mm and {self.way} of the {self.kind}, or neither to fit it")
@@ -124,14 +124,14 @@ class PlacedShape:
 
         Distances beyond ``reach_mm`` are NaN.
         """
-        away, direction = points_mm - self.point_mm, self.direction
+        offset, direction = points_mm - self.point_mm, self.direction
         if self.kind == "plane" and direction is not None:
-            normals, distance = np.broadcast_to(direction, away.shape), away @ direction
+            normals, distance = np.broadcast_to(direction, offset.shape), offset @ direction
         else:
             if direction is not None:
-                away = away - np.outer(away @ direction, direction)
-            length = np.linalg.norm(away, axis=1)
-            normals, distance = away / np.maximum(length, 1e-300)[:, None], length - self.radius_mm
+                offset = offset - np.outer(offset @ direction, direction)
+            length = np.linalg.norm(offset, axis=1)
+            normals, distance = offset / np.maximum(length, 1e-300)[:, None], length - self.radius_mm
         return np.where(np.abs(distance) <= reach_mm, distance, np.nan), normals
 
     def note_misfit(self, places_mm: np.ndarray, distance_mm: np.ndarray, variance_mm2: np.ndarray) -> str:
@@ -420,8 +420,8 @@ def fit_local_normals(
     middles = surface[tree.query(places, workers=-1)[1]]
     for start in range(0, len(places), _AT_A_TIME):
         here = slice(start, start + _AT_A_TIME)
-        away, neighbours = tree.query(middles[here], k=min(2 * POINTS_PER_DISC, len(surface)), workers=-1)
-        kept = ((away <= np.maximum(disc_mm, away[:, 7:8])) | (np.arange(away.shape[1]) < 8))[..., None]
+        distance, neighbours = tree.query(middles[here], k=min(2 * POINTS_PER_DISC, len(surface)), workers=-1)
+        kept = ((distance <= np.maximum(disc_mm, distance[:, 7:8])) | (np.arange(distance.shape[1]) < 8))[..., None]
         near = surface[neighbours]
         about = kept * (near - (kept * near).sum(axis=1, keepdims=True) / kept.sum(axis=1, keepdims=True))
         result[here] = np.linalg.eigh(np.einsum("pki,pkj->pij", about, about))[1][:, :, 0]

@@ -81,12 +81,12 @@ def average_locally(
     patterns = np.zeros((len(places), 0 if uncertainty is None else len(uncertainty.patterns_mm)))
     deep = np.broadcast_to(deep_mm, len(places))
     radius = float(np.hypot(disc_mm / 2, deep.max(initial=0.0)))
-    for block, place, point in _nearby_pairs(KDTree(points), places, radius):
+    for block, place, point in _pair_blocks(KDTree(points), places, radius):
         # The numbers of places count within the block: no array of a block has the size of all places.
         size, own_normals = block.stop - block.start, normals[block]
-        away = points[point] - places[block][place]
-        along = np.einsum("ni,ni->n", away, own_normals[place])
-        across = np.einsum("ni,ni->n", away, away) - along**2
+        offset = points[point] - places[block][place]
+        along = np.einsum("ni,ni->n", offset, own_normals[place])
+        across = np.einsum("ni,ni->n", offset, offset) - along**2
         inside = (across <= (disc_mm / 2) ** 2) & (np.abs(along) <= deep[block][place])
         if distance_mm is not None:
             along = distance_mm[point]
@@ -101,7 +101,7 @@ def average_locally(
         if frame is not None:
             together[block], alone[block] = _image_sums(place, frame[point], off, scatter, number)
         if uncertainty is not None:
-            found = _propagated_variance(place, point, own_normals, uncertainty, frame, number)
+            found = _propagate_variance(place, point, own_normals, uncertainty, frame, number)
             stated[block], other[block], patterns[block] = found
     # The empirical scatter includes that between images.
     variance = np.maximum(_correlation_factor(together, alone, count) * rough, stated + other)
@@ -116,7 +116,7 @@ def _student_ratio(number: np.ndarray) -> np.ndarray:
     return table[np.minimum(number, _NEARLY_NORMAL)]
 
 
-def _nearby_pairs(tree: KDTree, places: np.ndarray, radius: float) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+def _pair_blocks(tree: KDTree, places: np.ndarray, radius: float) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
     """Yield blocks of places, with the numbers of places within the block and of points of nearby pairs."""
     counts = tree.query_ball_point(places, radius, return_length=True, workers=-1)
     part = np.cumsum(counts) // _PAIRS_AT_A_TIME
@@ -129,7 +129,7 @@ def _nearby_pairs(tree: KDTree, places: np.ndarray, radius: float) -> Iterator[t
             yield slice(start, end), np.repeat(np.arange(end - start), lengths), point
 
 
-def _propagated_variance(
+def _propagate_variance(
     place: np.ndarray,
     point: np.ndarray,
     normals: np.ndarray,

@@ -120,7 +120,7 @@ def mesh(
             "`patch_radius_mm`"
         )
     every = points.points_mm[:: max(1, len(points.points_mm) // _WALLS_ASKED)]
-    away = np.asarray(KDTree(places[used]).query(every, distance_upper_bound=radius)[0])
+    distance = np.asarray(KDTree(places[used]).query(every, distance_upper_bound=radius)[0])
     return SurfaceMesh(
         places[used],
         patches.normals[used],
@@ -129,7 +129,7 @@ def mesh(
         patches.shared_mm[used],
         cube,
         radius,
-        float(np.mean(~np.isfinite(away))),
+        float(np.mean(~np.isfinite(distance))),
         {"clouds": [dict(cloud.metadata) for cloud in read], "scans": len(scans)},
     )
 
@@ -282,8 +282,8 @@ def _march_cubes(corners: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray,
 
 def _weld_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Merge coincident vertices on the boundaries of blocks."""
-    away = np.abs(vertices / _BLOCK - np.round(vertices / _BLOCK)) * _BLOCK
-    shared = np.flatnonzero((away < 1e-3).any(axis=1))
+    distance = np.abs(vertices / _BLOCK - np.round(vertices / _BLOCK)) * _BLOCK
+    shared = np.flatnonzero((distance < 1e-3).any(axis=1))
     if not len(shared):
         return vertices, faces
     pairs = shared[KDTree(vertices[shared]).query_pairs(1e-3, output_type="ndarray")]
@@ -307,7 +307,7 @@ def _remove_small_pieces(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
     links = coo_array((np.ones(len(edges), bool), edges.T), shape=(count, count))
     piece = connected_components(links, directed=False)[1]
-    own = piece[faces[:, 0]]
-    faces = faces[np.bincount(own, minlength=int(piece.max(initial=0)) + 1)[own] >= _FEWEST_OF_PIECE]
+    of_face = piece[faces[:, 0]]
+    faces = faces[np.bincount(of_face, minlength=int(piece.max(initial=0)) + 1)[of_face] >= _FEWEST_OF_PIECE]
     used, renumbered = np.unique(faces, return_inverse=True)
     return used, renumbered.reshape(-1, 3)

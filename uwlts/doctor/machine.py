@@ -125,9 +125,9 @@ def examine_renderer() -> list[Finding]:
     chosen = [line.removeprefix("chosen: ") for line in asked.stdout.splitlines() if line.startswith("chosen: ")]
     if asked.returncode == 0 and chosen:
         return [Finding("libLLVM", "ok", f"{chosen[0]}; a trial kernel ran")]
-    said = asked.stderr.strip().splitlines() or [f"it ended with status {asked.returncode}"]
+    lines = asked.stderr.strip().splitlines() or [f"it ended with status {asked.returncode}"]
     # The program's own errors are most specific in the first line, tracebacks in the last.
-    reason = said[0].removeprefix("error: ") if said[0].startswith("error: ") else said[-1]
+    reason = lines[0].removeprefix("error: ") if lines[0].startswith("error: ") else lines[-1]
     advice = f"only for rendering by the twin; how to install it says\n{shlex.join(command)}"
     return [Finding("libLLVM", "warning", f"the twin cannot render: {reason}", advice)]
 
@@ -350,5 +350,5 @@ def print_findings(findings: Sequence[Finding]) -> None:
         console.print(Text(f"  {each.subject}:{lines}"), soft_wrap=True)
     missing = [each.subject for each in findings if each.status == "missing"]
     warnings = sum(each.status == "warning" for each in findings)
-    said = f"missing: {', '.join(missing)}" if missing else "nothing that is required is missing"
-    console.print(Text(f"{said}; {warnings} warning{'' if warnings == 1 else 's'}"), soft_wrap=True)
+    text = f"missing: {', '.join(missing)}" if missing else "nothing that is required is missing"
+    console.print(Text(f"{text}; {warnings} warning{'' if warnings == 1 else 's'}"), soft_wrap=True)

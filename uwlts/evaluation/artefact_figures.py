@@ -167,12 +167,12 @@ def _fit_cap(
 ) -> tuple[np.ndarray, RobustFit[Sphere]]:
     if cap_angle_deg is None:
         return sphere.members, sphere.robust
-    away = points[sphere.members] - sphere.robust.fit.centre_mm
-    cosine = away @ TOWARDS_SENSOR / np.linalg.norm(away, axis=1)
+    offset = points[sphere.members] - sphere.robust.fit.centre_mm
+    cosine = offset @ TOWARDS_SENSOR / np.linalg.norm(offset, axis=1)
     members = sphere.members[cosine >= np.cos(np.radians(cap_angle_deg))]
     if len(members) < LEAST_POINTS:
         raise EvaluationError(
-            f"only {len(members)} of {len(away)} points of the sphere are within {cap_angle_deg:g} deg of the point "
+            f"only {len(members)} of {len(offset)} points of the sphere are within {cap_angle_deg:g} deg of the point "
             f"nearest to the sensor (-Z); {LEAST_POINTS} are needed. Increase cap_angle_deg"
         )
     return members, fit_robustly(Sphere.fit, points[members])
@@ -366,9 +366,9 @@ def measure_step(
     deviation[labels == StepFace.NEITHER] = np.nan
     heights = []
     for number in np.unique(frame[frame >= 0]):
-        own = frame == number
-        if min(np.count_nonzero(labels[own] == face) for face in planes) >= _LEAST_OF_PROFILE:
-            heights.append(step_height(points[own, 1:], labels[own], reference=artefact.reference).height_mm)
+        members = frame == number
+        if min(np.count_nonzero(labels[members] == face) for face in planes) >= _LEAST_OF_PROFILE:
+            heights.append(step_height(points[members, 1:], labels[members], reference=artefact.reference).height_mm)
     # The sheet is inclined to the step's normal, so a height within the sheet is divided by the cosine.
     by_profile = float(np.linalg.norm(planes[base].normal[1:])) * np.array(heights)
     mean = float(by_profile.mean()) if heights else None

@@ -111,7 +111,7 @@ class Evaluation(Brief, StoredResult):
     cloud: PointCloud | None = Field(default=None, alias="evaluated_cloud", exclude=True)
 
     @model_serializer(mode="wrap")
-    def _as_given(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
+    def _omit_missing(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Omit missing keys, since clouds of other programs have no metadata."""
         given = self.model_fields_set - {"source"}
         return {"cloud": self.source} | {key: value for key, value in plain(self).items() if key in given}
@@ -187,12 +187,12 @@ def _name_other_scene(header: TruthHeader, path: Path, metadata: Table) -> str |
     if (digest := metadata.get("scene")) is not None:
         found = scene_digest(header.scene)
         return None if found == digest else f"its scene has the digest {found}, the scene of {capture} has {digest}"
-    own, wanted = _kind_of_artefact(header.scene), _kind_of_artefact(metadata)
-    if own is not None and wanted is not None and own != wanted:
-        return f"it shows the artefact '{own}', the cloud '{wanted}'"
-    own, wanted = header.scene.get("medium"), metadata.get("medium")
-    if own is not None and wanted is not None and own != wanted:
-        return f"its medium is {own}, that of the cloud {wanted}"
+    stated, wanted = _kind_of_artefact(header.scene), _kind_of_artefact(metadata)
+    if stated is not None and wanted is not None and stated != wanted:
+        return f"it shows the artefact '{stated}', the cloud '{wanted}'"
+    stated, wanted = header.scene.get("medium"), metadata.get("medium")
+    if stated is not None and wanted is not None and stated != wanted:
+        return f"its medium is {stated}, that of the cloud {wanted}"
     # Captures of earlier versions do not state their scene.
     if isinstance(capture, str) and path.name != (expected := truth_path(capture).name):
         return f"the cloud is of {capture}, which does not state its scene, and whose truth is named {expected}"

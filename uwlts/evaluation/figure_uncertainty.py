@@ -154,8 +154,8 @@ def _linearise_spheres(points: np.ndarray, evaluation: SphereEvaluation) -> Line
     members = [np.flatnonzero(evaluation.labels == number) for number in range(len(evaluation.spheres))]
     free, known = (
         [
-            LinearisedFit(Sphere.fit(points[own], radius), points, own)
-            for own, radius in zip(members, radii_mm, strict=True)
+            LinearisedFit(Sphere.fit(points[indices], radius), points, indices)
+            for indices, radius in zip(members, radii_mm, strict=True)
         ]
         for radii_mm in ([None] * len(members), [diameter / 2 for diameter in artefact.diameters_mm])
     )

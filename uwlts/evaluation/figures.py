@@ -219,14 +219,14 @@ class ArtefactEvaluation:
 
     def as_dict(self) -> dict[str, Any]:
         """Return everything except the artefact and the deviations of single points as JSON."""
-        own = [
+        extra = [
             field.name for field in dataclasses.fields(self) if field.name not in ("artefact", "deviation_mm", "labels")
         ]
         return {
             "kind": self.artefact.kind,
             "figures_mm": self.figures_mm,
             "points_total": self.points_total,
-            **{name: to_jsonable_python(getattr(self, name)) for name in own},
+            **{name: to_jsonable_python(getattr(self, name)) for name in extra},
             "rejected_share": self.rejected_share,
             "vdi_range_mm": self.vdi_range_mm,
             "within_vdi_outliers": self.within_vdi_outliers,
@@ -296,7 +296,7 @@ class TruthComparison(StoredResult):
     distance_mm: np.ndarray = Field(default=_NO_POINTS, exclude=True)
 
     @model_serializer(mode="wrap")
-    def _without_missing(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
+    def _omit_missing(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
         return {key: value for key, value in plain(self).items() if value is not None}
 
 

@@ -15,7 +15,7 @@ from pydantic import BaseModel, JsonValue, ValidationError
 
 from uwlts.errors import CaptureError, Error, OutputError, describe_problems
 from uwlts.files.reading import MOST_JSON_BYTES, add_article, find_not_finite, log_warnings, parse_json, read_text
-from uwlts.files.writing import require_ending, write_atomically
+from uwlts.files.writing import require_ending, write_file
 
 _SHOWN = 3  # largest number of different entries that a message names
 _BRIEF = 80  # largest number of characters of a value in a message
@@ -123,8 +123,7 @@ def write_model(path: str | Path, model: BaseModel, *, file_format: str, version
 def write_record(path: str | Path, record: object, *, overwrite: bool, indent: int = 1) -> None:
     """Write the record of a result as indented JSON, completely or not at all; raises OutputError if that fails."""
     require_ending(Path(path), (".json",))
-    with write_atomically(path, overwrite=overwrite) as aside:
-        aside.write_text(json_text(record, indent=indent), encoding="utf-8")
+    write_file(path, json_text(record, indent=indent), overwrite=overwrite)
 
 
 def describe_differences(there: object, now: object) -> str:

@@ -54,6 +54,12 @@ def write_atomically(path: str | os.PathLike[str], *, overwrite: bool = False) -
         _incomplete.discard(aside)
 
 
+def write_file(path: str | os.PathLike[str], content: str | bytes | memoryview, *, overwrite: bool = False) -> None:
+    """Write text (UTF-8) or bytes like `write_atomically`."""
+    with write_atomically(path, overwrite=overwrite) as aside:
+        aside.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
 @contextmanager
 def name_write_errors(target: Path) -> Iterator[None]:
     """Raise OutputError, which names ``target``, for any OSError of the body."""

@@ -79,9 +79,9 @@ def profile_rows(
     starts = np.searchsorted(section[order], np.arange(count + 1))
     columns, values, lengths = [], [], [0]
     for k in range(count):
-        own = order[starts[k] : starts[k + 1]]
-        place = across[own]
-        nothing = own[:1] if len(own) else order[:1]
+        members = order[starts[k] : starts[k + 1]]
+        place = across[members]
+        nothing = members[:1] if len(members) else order[:1]
         first, last = np.searchsorted(place, grid - bandwidth), np.searchsorted(place, grid + bandwidth)
         for middle, a, b in zip(grid, first, last, strict=True):
             u, row, near = (place[a:b] - middle) / bandwidth, np.array([np.nan]), nothing
@@ -89,7 +89,7 @@ def profile_rows(
                 design = np.stack([np.ones(len(u)), u, u * u], axis=1)
                 loaded = (design * np.maximum(1 - u * u, 0)[:, None]).T
                 if np.linalg.cond(normal := loaded @ design) <= 1e6:
-                    row, near = np.linalg.solve(normal, np.eye(3)[0]) @ loaded, own[a:b]
+                    row, near = np.linalg.solve(normal, np.eye(3)[0]) @ loaded, members[a:b]
             columns.append(near)
             values.append(row)
             lengths.append(lengths[-1] + len(row))
@@ -111,8 +111,8 @@ def cubic_weights(cells: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarra
     1981, Eq. 15).
     """
     at = np.floor(cells).astype(int)[:, None] + np.arange(-1, 3)
-    away = np.abs(cells[:, None] - at)
-    weight = np.where(away <= 1, (1.5 * away - 2.5) * away**2 + 1, ((-0.5 * away + 2.5) * away - 4) * away + 2)
+    dist = np.abs(cells[:, None] - at)
+    weight = np.where(dist <= 1, (1.5 * dist - 2.5) * dist**2 + 1, ((-0.5 * dist + 2.5) * dist - 4) * dist + 2)
     return np.clip(at, 0, length - 1), np.where((at >= 0) & (at < length), weight, 0.0)
 
 
@@ -140,16 +140,16 @@ def largest_mean(profiles: Sequence[np.ndarray], count: int, *, noise: float | N
     one value to the next.
     """
     known = [np.flatnonzero(np.isfinite(profile)) for profile in profiles]
-    owns = [profile[own] for profile, own in zip(profiles, known, strict=True) if len(own)]
+    owns = [profile[one] for profile, one in zip(profiles, known, strict=True) if len(one)]
     weights = [np.zeros(len(profile)) for profile in profiles]
     if not owns:
         return Largest(np.nan, np.nan, np.nan, tuple(weights))
-    jumps = np.concatenate([np.diff(own) for own in owns])
+    jumps = np.concatenate([np.diff(one) for one in owns])
     seen_noise = robust_std(jumps) / np.sqrt(2) if len(jumps) else 0.0
     std = seen_noise if noise is None else noise
     rng = np.random.default_rng(SEED)
-    means = [_average_neighbours(own[None], count) for own in owns]
-    drawn = [_average_neighbours(std * rng.standard_normal((_DRAWS, len(own))), count) for own in owns]
+    means = [_average_neighbours(one[None], count) for one in owns]
+    drawn = [_average_neighbours(std * rng.standard_normal((_DRAWS, len(one))), count) for one in owns]
     seen = max(float(each.max()) for each in means)
     alone = np.max([each.max(axis=1) for each in drawn], axis=0)
     again = np.max([(mean + move).max(axis=1) for mean, move in zip(means, drawn, strict=True)], axis=0)
@@ -157,10 +157,10 @@ def largest_mean(profiles: Sequence[np.ndarray], count: int, *, noise: float | N
     low = seen - float(np.quantile(alone, 1 - tail))
     high = seen + COVERAGE_FACTOR * max(float(each.std(axis=0).max()) for each in drawn)
     value = float(np.clip(seen - BIAS_FACTOR * (again.mean() - seen), low, high))
-    for number, own in enumerate(k for k in range(len(profiles)) if len(known[k])):
+    for number, one in enumerate(k for k in range(len(profiles)) if len(known[k])):
         if float(means[number].max()) == seen:
             first = int(np.argmax(means[number]))
-            weights[own][known[own][first : first + min(count, len(known[own]))]] = 1 / min(count, len(known[own]))
+            weights[one][known[one][first : first + min(count, len(known[one]))]] = 1 / min(count, len(known[one]))
             break
     return Largest(value, low, high, tuple(weights))
 

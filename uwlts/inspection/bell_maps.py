@@ -283,13 +283,13 @@ def _standardise(values: np.ndarray, block: int) -> tuple[np.ndarray, np.ndarray
     middle, spread, freedom = (np.full(counts, np.nan) for _ in range(3))
     for i in range(counts[0]):
         for j in range(counts[1]):
-            own = values[edges[0][i] : edges[0][i + 1], edges[1][j] : edges[1][j + 1]]
-            own = own[np.isfinite(own)]
-            if len(own) < 4 * np.pi * SEARCH_RULE.cells_per_radius**2:
+            tile = values[edges[0][i] : edges[0][i + 1], edges[1][j] : edges[1][j + 1]]
+            tile = tile[np.isfinite(tile)]
+            if len(tile) < 4 * np.pi * SEARCH_RULE.cells_per_radius**2:
                 continue
-            middle[i, j] = np.median(own)
-            spread[i, j] = MAD_TO_STD * np.median(np.abs(own - middle[i, j]))
-            freedom[i, j] = max(3.0, _MAD_EFFICIENCY * len(own) / (np.pi * SEARCH_RULE.cells_per_radius**2))
+            middle[i, j] = np.median(tile)
+            spread[i, j] = MAD_TO_STD * np.median(np.abs(tile - middle[i, j]))
+            freedom[i, j] = max(3.0, _MAD_EFFICIENCY * len(tile) / (np.pi * SEARCH_RULE.cells_per_radius**2))
     known = np.isfinite(spread)
     if not known.any():
         return np.full(values.shape, np.nan), np.full(values.shape, np.nan)

@@ -186,11 +186,11 @@ def _assign_outliers(
     """
     heights, left = surface.heights, outliers.copy()
     for number, (peak, outcome, points) in enumerate(found):
-        away = np.flatnonzero(outliers & (heights * peak.height > 0))
-        if not len(away) or not len(points):
+        loose = np.flatnonzero(outliers & (heights * peak.height > 0))
+        if not len(loose) or not len(points):
             continue
-        is_near = KDTree(surface.places[points]).query(surface.places[away])[0] <= radius
-        near, share = away[is_near], np.count_nonzero(~is_near) / (len(outliers) - len(points))
+        is_near = KDTree(surface.places[points]).query(surface.places[loose])[0] <= radius
+        near, share = loose[is_near], np.count_nonzero(~is_near) / (len(outliers) - len(points))
         left[near] = False
         is_rare = stats.binom.sf(len(near) - 1, len(points) + len(near), share) * len(found) < false_alarm
         if is_rare and isinstance(outcome, float):
@@ -207,9 +207,9 @@ def _assign_outliers(
         count, group = csgraph.connected_components(joined, directed=False)
         for points in (together[group == k] for k in range(count)):
             # A group is bounded by the least of its points.
-            away, top = np.abs(heights[points]), int(points[np.argmax(np.abs(heights[points]))])
+            loose, top = np.abs(heights[points]), int(points[np.argmax(np.abs(heights[points]))])
             reason = f"{len(points)} points show it; {SEARCH_RULE.points_in_smallest} are needed"
-            departures.append(UnresolvedDeparture(top, float(heights[top]), float(away.min()), reason))
+            departures.append(UnresolvedDeparture(top, float(heights[top]), float(loose.min()), reason))
     return departures
 
 
@@ -319,8 +319,8 @@ def _grow_region(
     It is the rest of an indication with points ``taken`` (m, 2) if it touches them, and is not clearly higher
     elsewhere.
     """
-    away = np.hypot(*places.T)
-    ring = away > 0.5 * reach
+    dist = np.hypot(*places.T)
+    ring = dist > 0.5 * reach
     if np.count_nonzero(ring) < 2 * SEARCH_RULE.fewest_points:
         raise EvaluationError(
             f"{np.count_nonzero(ring)} undamaged points surround it; {2 * SEARCH_RULE.fewest_points} are needed"
@@ -342,8 +342,8 @@ def _grow_region(
         SEARCH_RULE.edge_share * float(core.max()), SEARCH_RULE.edge_std * noise / np.sqrt(np.maximum(count, 1))
     )
     labelled: Any = ndimage.label(mean > level)
-    own = labelled[0][middle - 1 : middle + 2, middle - 1 : middle + 2]
-    region = np.isin(labelled[0], own[own > 0])
+    near = labelled[0][middle - 1 : middle + 2, middle - 1 : middle + 2]
+    region = np.isin(labelled[0], near[near > 0])
     wide: Any = ndimage.binary_dilation(region)
     cut = bool(region[[0, 1, -2, -1], :].any() or region[:, [0, 1, -2, -1]].any())
     beside: Any = np.zeros((side, side), bool)
@@ -354,4 +354,4 @@ def _grow_region(
     saddle = float(np.max(mean, where=region & beside, initial=0.0))
     is_rest = touches and saddle >= SEARCH_RULE.saddle * top
     is_within = np.sign(peak.height) * plane[0] > SEARCH_RULE.edge_share * top
-    return _Region(wide[cells[:, 0], cells[:, 1]] | (away < SEARCH_RULE.core * peak.radius), cut, is_rest, is_within)
+    return _Region(wide[cells[:, 0], cells[:, 1]] | (dist < SEARCH_RULE.core * peak.radius), cut, is_rest, is_within)

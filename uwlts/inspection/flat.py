@@ -211,7 +211,7 @@ def inspect_gap(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
     turn = np.stack([along, across])
     # A line through each edge: its place in the middle and its slope.
     t, place = turn @ (edges.places - middle).T
-    design = np.column_stack([own * term for own in (edges.first, ~edges.first) for term in (np.ones(len(t)), t)])
+    design = np.column_stack([one * term for one in (edges.first, ~edges.first) for term in (np.ones(len(t)), t)])
     rows = np.linalg.pinv(design)
     lines = rows @ place
     sign, left = np.sign(lines[2] - lines[0]), place - design @ lines
@@ -304,10 +304,10 @@ def _estimate_step_height(levels: np.ndarray) -> float:
     low, high = np.quantile(levels, [0.001, 0.999])
     count, edges = np.histogram(levels, bins=_Rule.histogram_bins, range=(low, high))
     first = int(np.argmax(count))
-    apart = np.abs(np.arange(len(count)) - first) > _Rule.level_bins
-    if high <= low or not count[apart].any():
+    elsewhere = np.abs(np.arange(len(count)) - first) > _Rule.level_bins
+    if high <= low or not count[elsewhere].any():
         raise EvaluationError("only one face found: the cloud has to show both faces of the step")
-    second = int(np.argmax(np.where(apart, count, 0)))
+    second = int(np.argmax(np.where(elsewhere, count, 0)))
     return float(abs(edges[second] - edges[first]))
 
 
@@ -339,8 +339,8 @@ def _make_inspection(
     notes: Sequence[str] = (),
 ) -> Inspection:
     deviation = np.full(len(cloud), np.nan)
-    for own, face in faces:
-        deviation[own] = face.residuals_mm
+    for scan, face in faces:
+        deviation[scan] = face.residuals_mm
     if cloud.uncertainty is None:
         notes = WITHOUT_UNCERTAINTY, *notes
     return Inspection(kind, features, deviation, np.full(len(cloud), np.nan), tuple(notes)).consider_cloud(cloud)
@@ -407,18 +407,18 @@ def _find_gaps(cloud: PointCloud, face: _Face, used: np.ndarray) -> list[_Edges]
             "`reconstruct` has made"
         )
     order = np.lexsort((cloud.line[used], cloud.frame[used]))
-    own = used[order]
-    frame, line = cloud.frame[own], cloud.line[own]
-    local = (cloud.points_mm[own] - face.point_mm) @ face.axes[:2].T
+    sorted_used = used[order]
+    frame, line = cloud.frame[sorted_used], cloud.line[sorted_used]
+    local = (cloud.points_mm[sorted_used] - face.point_mm) @ face.axes[:2].T
     same = frame[1:] == frame[:-1]
     step = np.linalg.norm(np.diff(local, axis=0), axis=1)
     spacing = float(np.median(step[same & (np.diff(line) == 1)]))
     at = np.flatnonzero(same & (np.diff(line) >= _Rule.gap_lines) & (step > _Rule.gap_lines * spacing))
     if not len(at):
         return []
-    beyond = _locate_edges(cloud, own, np.append(0, np.cumsum(~same)), face, spacing)
+    beyond = _locate_edges(cloud, sorted_used, np.append(0, np.cumsum(~same)), face, spacing)
     number = np.unique(cloud.frame, return_inverse=True)[1]
-    image = number[own[at]]
+    image = number[sorted_used[at]]
     lower, upper = line[at], line[at + 1]
     overlaps = (image == image[:, None] + 1) & (lower <= upper[:, None]) & (upper >= lower[:, None])
     labels = connected_components(overlaps, directed=False)[1]
@@ -432,28 +432,28 @@ def _find_gaps(cloud: PointCloud, face: _Face, used: np.ndarray) -> list[_Edges]
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         outwards = np.concatenate([direction, -direction])
         places = local[inner] + beyond[inner, first.astype(int)][:, None] * outwards
-        points = own[inner]
+        points = sorted_used[inner]
         patterns = None if known is None else known.patterns_mm[:, points] @ face.axes[:2].T
         result.append(_Edges(places, frame[inner], first, patterns, points, spacing))
     return result
 
 
-def _locate_edges(cloud: PointCloud, own: np.ndarray, row: np.ndarray, face: _Face, spacing: float) -> np.ndarray:
+def _locate_edges(cloud: PointCloud, members: np.ndarray, row: np.ndarray, face: _Face, spacing: float) -> np.ndarray:
     """Return the distances (N, 2) from each point to an edge after it and before it along its profile.
 
     A blur with standard deviation s leaves the fraction Phi(d / s) of the brightness at a distance d within the edge.
     The distance is half a spacing if brightness or blur is unknown, or if the result exceeds one spacing.
     """
-    result = np.full((len(own), 2), 0.5 * spacing)
-    bright = cloud.intensity[own].astype(float)
-    size = project_footprint(cloud, own, np.broadcast_to(face.axes[:2], (len(own), 2, 3)))[0]
-    along = np.diff(cloud.points_mm[own] @ face.axes[:2].T, axis=0)[np.diff(row) == 0]
+    result = np.full((len(members), 2), 0.5 * spacing)
+    bright = cloud.intensity[members].astype(float)
+    size = project_footprint(cloud, members, np.broadcast_to(face.axes[:2], (len(members), 2, 3)))[0]
+    along = np.diff(cloud.points_mm[members] @ face.axes[:2].T, axis=0)[np.diff(row) == 0]
     axis = int(np.argmax(np.median(np.abs(along), axis=0)))
     blur = size[:, axis]
     if not (np.isfinite(bright).all() and (blur > 0).all()):
         return result
     for side, sign in ((0, -1), (1, 1)):
-        inner = np.stack([np.clip(np.arange(len(own)) + sign * k, 0, len(own) - 1) for k in _Rule.plain_lines])
+        inner = np.stack([np.clip(np.arange(len(members)) + sign * k, 0, len(members) - 1) for k in _Rule.plain_lines])
         known = (row[inner] == row).all(axis=0)
         share = bright / np.maximum(np.median(bright[inner], axis=0), 1e-9)
         within = blur * norm.ppf(np.clip(share, 0.02, 0.98))
@@ -471,10 +471,10 @@ def _fit_hole(edges: _Edges) -> _Hole:
         raise EvaluationError(f"its edge has {len(edges.places)} points, at least {_Rule.fewest_edges} are needed")
     circle = Circle.fit(edges.places)
     middle, radius = circle.centre_mm, circle.radius_mm
-    away = edges.places - middle
-    distance = np.linalg.norm(away, axis=1)
+    offset = edges.places - middle
+    distance = np.linalg.norm(offset, axis=1)
     left = distance - radius
-    angle = np.sort(np.degrees(np.arctan2(away[:, 1], away[:, 0])))
+    angle = np.sort(np.degrees(np.arctan2(offset[:, 1], offset[:, 0])))
     seen = 360 - float(np.max(np.diff(np.append(angle, angle[0] + 360))))
     scatter = float(np.sqrt(np.sum(left**2) / (len(left) - 3)))
     if scatter > (limit := max(_Rule.roundness * radius, 1.5 * edges.spacing)):
@@ -483,11 +483,11 @@ def _fit_hole(edges: _Edges) -> _Hole:
         )
     if seen < _Rule.hole_arc_deg:
         raise EvaluationError(f"the cloud shows {seen:.0f} deg of its edge; {_Rule.hole_arc_deg:.0f} deg are needed")
-    rows = np.linalg.pinv(np.column_stack([away / distance[:, None], np.ones(len(left))]))
+    rows = np.linalg.pinv(np.column_stack([offset / distance[:, None], np.ones(len(left))]))
     random = max(scatter, edges.spacing * _Rule.edge_std) ** 2 * rows @ rows.T
     moved = None
     if edges.patterns is not None:
-        moved = np.einsum("mej,ej->me", edges.patterns, away / distance[:, None]) @ rows.T
+        moved = np.einsum("mej,ej->me", edges.patterns, offset / distance[:, None]) @ rows.T
     return _Hole(middle, radius, random, moved, edges.points, _Rule.edge_blur * edges.spacing)
 
 
@@ -503,8 +503,8 @@ def _measure_bolt_circle(bolts: list[_Hole]) -> tuple[FeatureValue, list[float]]
     middles = np.array([hole.middle for hole in bolts])
     circle = Circle.fit(middles)
     centre, radius = circle.centre_mm, circle.radius_mm
-    away = middles - centre
-    units = away / np.linalg.norm(away, axis=1, keepdims=True)
+    offset = middles - centre
+    units = offset / np.linalg.norm(offset, axis=1, keepdims=True)
     rows = np.linalg.pinv(np.column_stack([units, np.ones(len(bolts))]))
     std = np.array([np.sqrt(u @ hole.random[:2, :2] @ u) for u, hole in zip(units, bolts, strict=True)])
     random, common = 2 * float(np.sqrt(np.sum((rows[2] * std) ** 2))), None
@@ -513,7 +513,7 @@ def _measure_bolt_circle(bolts: list[_Hole]) -> tuple[FeatureValue, list[float]]
         along = np.array([move[:, :2] @ u for move, u in zip(moves, units, strict=True)])
         common = 2 * float(np.linalg.norm(rows[2] @ along))
     value = plain_value(FeatureKind.FLANGE, "bolt circle", 2 * radius, random, common)
-    angle = np.arctan2(away[:, 1], away[:, 0])
+    angle = np.arctan2(offset[:, 1], offset[:, 0])
     # Holes may be missing: the smallest angle between two holes gives the division.
     between = np.diff(np.sort(np.append(angle, angle.min() + 2 * np.pi)))
     count = max(len(bolts), round(2 * np.pi / float(np.min(between))))
@@ -541,8 +541,8 @@ def _measure_parallelism(cloud: PointCloud, face: _Face, used: np.ndarray, datum
     facing = 1.0 if face.axes[2] @ other.axes[2] > 0 else -1.0
     slopes = facing * face.axes[:2] @ other.axes[2]
     random, common = np.zeros((2, 2)), None
-    for own, plane, chosen in ((cloud, face, used), (datum, other, on_datum)):
-        errors: PointErrors = PointErrors.along_normals(own, chosen, np.broadcast_to(plane.axes[2], (len(chosen), 3)))
+    for scan, plane, chosen in ((cloud, face, used), (datum, other, on_datum)):
+        errors: PointErrors = PointErrors.along_normals(scan, chosen, np.broadcast_to(plane.axes[2], (len(chosen), 3)))
         rows = (face.axes[:2] @ plane.axes[:2].T) @ plane.rows[1:]
         by_noise, by_common = errors.covariances(rows, plane.residuals_mm, group_neighbours(len(chosen)))
         random = random + by_noise

@@ -54,7 +54,7 @@ _SMALLEST = 1e-12  # lower bound of a scatter, mm, so that rounding of exact hei
 class LargeBlemish:
     """Large blemish with those inside and beside it."""
 
-    own: Indication  # the large one, with the points of those inside it
+    indication: Indication  # the large one, with the points of those inside it
     chosen: np.ndarray  # (n,) int; points of the window
     surface: UnrolledSurface  # window with heights relative to the large blemish's surface
     # (n,); height of that surface above the undamaged one, and its standard uncertainty by the smoothing.
@@ -64,17 +64,17 @@ class LargeBlemish:
     largest_mm: float  # largest radius of this search
 
     def explains(self, other: Indication) -> bool:
-        """Return whether an indication of the first search is the large one, its rim, or was searched for again.
+        """Return True for the large indication itself, its rim, and what the second search covers.
 
         A rim departs from its surroundings in the other direction, but not from the undamaged surface.
         """
-        if other is self.own:
+        if other is self.indication:
             return True
         inside = np.isin(self.chosen, other.points)
         if np.count_nonzero(inside) < 0.5 * len(other.points):
             return False
         height = float(np.mean((self.surface.heights + self.height_mm)[inside]))
-        is_rim = other.height_mm * self.own.height_mm < 0 and height / other.height_mm < SEARCH_RULE.edge_share
+        is_rim = other.height_mm * self.indication.height_mm < 0 and height / other.height_mm < SEARCH_RULE.edge_share
         return is_rim or other.radius_mm <= self.largest_mm
 
     def parts_beside(self, others: Sequence[Indication]) -> list[Indication]:
@@ -118,7 +118,7 @@ class LargeBlemish:
         if values[0].low <= 0:
             raise NotSignificantError(f"it is not significant relative to the surface below: {values[0].text()}")
         deepest, total = float(np.abs(self.height_mm).max()), depth.value + found.beneath_mm
-        in_hollow = self.own.height_mm < 0 and found.beneath_mm > SEARCH_RULE.edge_share * deepest
+        in_hollow = self.indication.height_mm < 0 and found.beneath_mm > SEARCH_RULE.edge_share * deepest
         if found.reason is not None and in_hollow and total < deepest:
             raise NotSignificantError(f"{found.reason}, and the hollow around it is deeper")
         if found.kind != FeatureKind.PROTRUSION and in_hollow:
@@ -134,8 +134,8 @@ def search_within(surface: UnrolledSurface, search: BlemishSearch, large: Indica
 
     ``surface`` and ``search`` are those of the whole pipe, cut open far from the large blemish.
     """
-    own = surface.places[large.points]
-    low, high = own.min(axis=0), own.max(axis=0)
+    places = surface.places[large.points]
+    low, high = places.min(axis=0), places.max(axis=0)
     radius = 0.25 * float(np.sum(high - low))
     bandwidth = _Rule.bandwidth * radius
     if 0.5 * bandwidth < search.smallest_mm:

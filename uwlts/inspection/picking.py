@@ -157,8 +157,8 @@ def cut_section(cloud: PointCloud, first_mm: np.ndarray, second_mm: np.ndarray, 
     if length < _SMALLEST_MM:
         raise EvaluationError("both places of the section have the same X and Y: pick places beside each other")
     direction = way / length
-    away = (cloud.points_mm - first_mm) @ np.array([-direction[1], direction[0], 0.0])
-    inside = np.flatnonzero(np.abs(away) <= width_mm / 2)
+    distance = (cloud.points_mm - first_mm) @ np.array([-direction[1], direction[0], 0.0])
+    inside = np.flatnonzero(np.abs(distance) <= width_mm / 2)
     if len(inside) == 0:
         raise EvaluationError(f"no points within the strip of {width_mm:g} mm: give a wider one")
     order = np.argsort(cloud.points_mm[inside] @ direction, kind="stable")

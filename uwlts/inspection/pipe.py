@@ -192,14 +192,14 @@ def _join_copies(search: BlemishSearch, copied: np.ndarray, count: int) -> Blemi
     """
     joined: list[Indication] = []
     for indication in sorted(search.indications, key=lambda each: len(each.points), reverse=True):
-        own = replace(indication, points=np.unique(copied[indication.points]))
+        one = replace(indication, points=np.unique(copied[indication.points]))
         for number, other in enumerate(joined):
             # An indication removes its points from the search: only copies are in two of them.
-            if own.height_mm * other.height_mm > 0 and np.isin(own.points, other.points, assume_unique=True).any():
-                joined[number] = replace(other, points=np.union1d(own.points, other.points))
+            if one.height_mm * other.height_mm > 0 and np.isin(one.points, other.points, assume_unique=True).any():
+                joined[number] = replace(other, points=np.union1d(one.points, other.points))
                 break
         else:
-            joined.append(own)
+            joined.append(one)
     undamaged = search.undamaged[:count].copy()
     for indication in joined:
         undamaged[indication.points] = False
@@ -275,7 +275,9 @@ def _blemish_features(
         try:
             blemish = measured_by()
         except EvaluationError as error:
-            inside = any(np.isin(points, w.own.points).all() and w.own is not indication for w, _ in large)
+            inside = any(
+                np.isin(points, w.indication.points).all() and w.indication is not indication for w, _ in large
+            )
             if inside or isinstance(error, NotSignificantError):
                 notes.append(_note_indication(cloud, chosen[points], indication.height_mm, f"is omitted: {error}"))
             else:
@@ -302,17 +304,17 @@ def _blemish_features(
         formed = [abs(part.height_mm) for part in parts if whole.is_form(part)]
         if formed:
             departs = f"has {len(formed)} departures of up to {max(formed):.2g} mm from a smooth surface, by its form"
-            notes.append(_note_indication(cloud, chosen[whole.own.points], whole.own.height_mm, departs))
+            notes.append(_note_indication(cloud, chosen[whole.indication.points], whole.indication.height_mm, departs))
         for part in parts:
             points = whole.chosen[part.points]
             if not taken[points].any() and not whole.is_form(part):
                 taken[points] = measure(part, points, middle, partial(whole.measure, part, errors, **sizes))
         for each in whole.search.unresolved:
-            if (point := whole.chosen[each.point]) in whole.own.points:
+            if (point := whole.chosen[each.point]) in whole.indication.points:
                 add_unsized(np.array([point]), each.height_mm, each.bound_mm, each.reason)
-        bare = whole.without(unroll_about(whole.own)[0], taken)
-        own = partial(measure_blemish, bare, search, whole.own, errors, **sizes)
-        measure(whole.own, whole.own.points, middle, own)
+        bare = whole.without(unroll_about(whole.indication)[0], taken)
+        measure_here = partial(measure_blemish, bare, search, whole.indication, errors, **sizes)
+        measure(whole.indication, whole.indication.points, middle, measure_here)
     for indication in search.indications:
         if not is_explained(indication):
             surface, middle = unroll_about(indication)
@@ -366,8 +368,8 @@ def _blemish_features(
 def _note_merged(feature: Feature) -> Iterator[str]:
     """Yield a note on a finding that consists of several neighbours."""
     if len(feature.hollows_mm):
-        away = np.linalg.norm(feature.hollows_mm[1:] - feature.hollows_mm[0], axis=1)
-        places = " and ".join(f"{each:.1f} mm" for each in sorted(away))
+        distance = np.linalg.norm(feature.hollows_mm[1:] - feature.hollows_mm[0], axis=1)
+        places = " and ".join(f"{each:.1f} mm" for each in sorted(distance))
         yield (
             f"{feature.name} is {len(feature.hollows_mm)} neighbours that the search joined, {places} from the "
             "deepest: its depth is that of the deepest, its length and width those of the contour around that one; "

@@ -156,8 +156,8 @@ def _fit_from(
     arc, moved, off, terms = 0.0, np.inf, np.zeros(0), ()
     coefficients, weight, design, rows = np.zeros(0), np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0))
     for number in range(FORM_RULE.rounds):
-        along, angle, away = frame.cylindrical(points)
-        off = away - radius
+        along, angle, height = frame.cylindrical(points)
+        off = height - radius
         near = np.abs(off - np.median(off)) < FORM_RULE.off_pipe * radius
         arc = _arc(angle[near])
         terms = _terms(arc)
@@ -192,8 +192,8 @@ def _fit_from(
     # These terms are now part of the frame and the radius.
     inside = np.array([term in ("1", "cos", "sin", "along cos", "along sin") for term in terms])
     coefficients = np.where(inside, 0.0, coefficients)
-    along, angle, away = frame.cylindrical(cloud.points_mm)
-    distance = away - radius - _evaluate_terms(along, angle, scale, terms, coefficients)
+    along, angle, height = frame.cylindrical(cloud.points_mm)
+    distance = height - radius - _evaluate_terms(along, angle, scale, terms, coefficients)
     used = fitted[counted]
     known = frame, radius, along, angle, distance, used, arc, terms, coefficients, rows[:, counted], scale
     return PipeForm(*known, largest_ovality)
@@ -210,7 +210,7 @@ def pipe_features(
     """
     used = form.used
     errors = PointErrors.along_normals(cloud, used, form.frame.normals_at(form.angle[used]))
-    whole = _whole_values(form, errors)
+    whole = _make_whole_values(form, errors)
     extent = np.array([2 * form.radius_mm, 2 * form.radius_mm, np.ptp(form.along_mm[used])])
     features = [Feature(FeatureKind.PIPE, "pipe", whole, form.frame.point_mm, form.frame.axes, extent, used)]
     along = form.along_mm[used]
@@ -224,31 +224,31 @@ def pipe_features(
     notes: list[str] = []
     for start, end in pairwise(edges):
         inside = (along >= start) & ((along < end) | (end == edges[-1]))
-        own = used[inside]
-        arc, least = _arc(form.angle[own]), FORM_RULE.section_arc * min(form.arc, FORM_RULE.oval_arc)
-        if len(own) < FORM_RULE.section_points or arc < least:
+        members = used[inside]
+        arc, least = _arc(form.angle[members]), FORM_RULE.section_arc * min(form.arc, FORM_RULE.oval_arc)
+        if len(members) < FORM_RULE.section_points or arc < least:
             notes.append(
-                f"no section from {start:.4g} to {end:.4g} mm along the axis: {len(own)} points over "
+                f"no section from {start:.4g} to {end:.4g} mm along the axis: {len(members)} points over "
                 f"{np.degrees(arc):.0f} deg; {FORM_RULE.section_points} over {np.degrees(least):.0f} deg are needed"
             )
             continue
-        design = _design(np.zeros(len(own)), form.angle[own], 1.0, terms)
+        design = _design(np.zeros(len(members)), form.angle[members], 1.0, terms)
         weights = np.linalg.pinv(design, rcond=1e-6)
-        coefficients = weights @ raw[own]
+        coefficients = weights @ raw[members]
         middle = form.frame.point_mm + 0.5 * (start + end) * form.frame.axes[2]
         if form.is_seen_round:
             middle = middle + coefficients[1] * form.frame.axes[0] + coefficients[2] * form.frame.axes[1]
-            left = raw[own] - design @ coefficients
+            left = raw[members] - design @ coefficients
             values = _section_values(form, errors[inside], weights, coefficients, left)
         else:
             values = (_arc_diameter(form, errors, inside, weights[0], float(coefficients[0])),)
         size = np.array([extent[0], extent[1], end - start])
         name = f"section {len(features)}"
-        features.append(Feature(FeatureKind.SECTION, name, values, middle, form.frame.axes, size, own))
+        features.append(Feature(FeatureKind.SECTION, name, values, middle, form.frame.axes, size, members))
     return features, notes
 
 
-def _whole_values(form: PipeForm, errors: PointErrors) -> tuple[FeatureValue, ...]:
+def _make_whole_values(form: PipeForm, errors: PointErrors) -> tuple[FeatureValue, ...]:
     kind, used, coefficients, diameter = FeatureKind.PIPE, form.used, form.coefficients, 2 * form.radius_mm
     random, common = errors.covariances(form.weights, form.distance_mm[used], _neighbourhoods(form, used))
     if not form.is_seen_round:
@@ -260,7 +260,7 @@ def _whole_values(form: PipeForm, errors: PointErrors) -> tuple[FeatureValue, ..
 
     def amplitude(name: str, terms: str, scale: float) -> FeatureValue:
         at = [form.terms.index(terms.format(each)) for each in ("cos", "sin")]
-        return amplitude_value(kind, name, coefficients[at], *_part_of(at, random, common), scale=scale)
+        return amplitude_value(kind, name, coefficients[at], *_select_covariance(at, random, common), scale=scale)
 
     values = [plain("diameter", diameter, "1", 2.0)]
     if form.is_seen_round:
@@ -282,7 +282,9 @@ def _whole_values(form: PipeForm, errors: PointErrors) -> tuple[FeatureValue, ..
     return tuple(values)
 
 
-def _part_of(at: list[int], random: np.ndarray, common: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+def _select_covariance(
+    at: list[int], random: np.ndarray, common: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray | None]:
     """Return the covariances of some parameters."""
     return random[np.ix_(at, at)], None if common is None else common[np.ix_(at, at)]
 
@@ -294,7 +296,7 @@ def _section_values(
     kind, at = FeatureKind.SECTION, [3, 4]
     known = errors.covariances(weights, left, group_neighbours(len(left)))
     diameter = float(2 * (form.radius_mm + coefficients[0]))
-    vector, two = coefficients[at], _part_of(at, *known)
+    vector, two = coefficients[at], _select_covariance(at, *known)
     size = max(float(np.linalg.norm(vector)), 1e-12)
     side = np.degrees(np.array([-vector[1], vector[0]]) / size**2 / 2)
     angle = 0.5 * float(np.degrees(np.arctan2(vector[1], vector[0])))
@@ -314,8 +316,8 @@ def _arc_diameter(
     the section. Their ``weights`` (K,) give its mean distance ``off`` from the pipe.
     """
     moved = [form.terms.index(term) for term in ("cos", "sin", "along cos", "along sin")]
-    own = form.used[inside]
-    by_axis = weights @ _design(form.along_mm[own], form.angle[own], form.scale_mm, form.terms)[:, moved]
+    members = form.used[inside]
+    by_axis = weights @ _design(form.along_mm[members], form.angle[members], form.scale_mm, form.terms)[:, moved]
     whole = -by_axis @ form.weights[moved]
     whole[inside] += weights
     random, common = errors.covariances(whole[None], form.distance_mm[form.used], _neighbourhoods(form, form.used))
@@ -359,11 +361,11 @@ def _design(along_mm: np.ndarray, angle: np.ndarray, scale: float, terms: tuple[
     t = np.asarray(along_mm) / scale
     columns = []
     for term in terms:
-        words = term.split(" ")
-        power = {"along": t, "along2": t * t}.get(words[0], 1.0)
-        words = [word for word in words if not word.startswith("along")]
-        order = int(words[1]) if len(words) > 1 else 1
-        match words[:1]:
+        factors = term.split(" ")
+        power = {"along": t, "along2": t * t}.get(factors[0], 1.0)
+        factors = [word for word in factors if not word.startswith("along")]
+        order = int(factors[1]) if len(factors) > 1 else 1
+        match factors[:1]:
             case ["cos"]:
                 columns.append(power * np.cos(order * angle))
             case ["sin"]:

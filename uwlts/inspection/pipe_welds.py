@@ -64,9 +64,9 @@ def find_welds(form: PipeForm, chosen: np.ndarray) -> list[PipeWeld]:
         for middle, half in ridges:
             # Cells are coarse: the points of the bead give its middle, and the rest of its inclination.
             terms = [np.ones(len(across)), *([np.cos(angle), np.sin(angle)] if is_girth else [])]
-            design, own = np.stack(terms, axis=1), np.abs(across - middle) < half
-            weights = np.sqrt(np.maximum(heights[own], 0))
-            fit = np.linalg.lstsq(design[own] * weights[:, None], across[own] * weights, rcond=None)[0]
+            design, members = np.stack(terms, axis=1), np.abs(across - middle) < half
+            weights = np.sqrt(np.maximum(heights[members], 0))
+            fit = np.linalg.lstsq(design[members] * weights[:, None], across[members] * weights, rcond=None)[0]
             off, at = whole.copy(), whole.copy()
             off[chosen], at[chosen] = across - design @ fit, length
             found.append(PipeWeld(is_girth, off, at, half))
@@ -132,13 +132,13 @@ def _find_ridges(across: np.ndarray, length: np.ndarray, heights: np.ndarray, ce
     labelled: Any = ndimage.label(least > _Rule.significant * std)
     found = []
     for number in range(1, labelled[1] + 1):
-        own = np.flatnonzero(labelled[0] == number)
-        crest = np.nanmedian(mean[own], axis=1)
-        core = own[crest > 0.5 * crest.max()]
+        members = np.flatnonzero(labelled[0] == number)
+        crest = np.nanmedian(mean[members], axis=1)
+        core = members[crest > 0.5 * crest.max()]
         # A parabola is 1.4 times as wide at its foot as at half its height, and cells widen it at most by one.
-        half = 0.5 * cell * max(1.4 * (np.ptp(core) + 1), len(own))
+        half = 0.5 * cell * max(1.4 * (np.ptp(core) + 1), len(members))
         middle = origin + cell * (float(np.average(core, weights=np.nanmedian(mean[core], axis=1))) + 0.5)
-        if own[0] > 0 and own[-1] < len(mean) - 1:
+        if members[0] > 0 and members[-1] < len(mean) - 1:
             found.append((middle, half))
     return found
 

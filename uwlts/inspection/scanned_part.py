@@ -147,13 +147,13 @@ class _Cells:
 
     def describe(self, form: PipeForm, region: np.ndarray) -> str:
         """Describe the place and the size of a second body."""
-        own = self.points_in(region & self.seen)
-        high = self.distance[own & (self.distance > FORM_RULE.off_pipe * form.radius_mm)]
+        members = self.points_in(region & self.seen)
+        high = self.distance[members & (self.distance > FORM_RULE.off_pipe * form.radius_mm)]
         rows = np.flatnonzero(region.any(axis=1))
         around = 360 * np.count_nonzero(region.any(axis=0)) / region.shape[1]
         along = (rows[-1] - rows[0] + 1) * np.ptp(form.along_mm) / region.shape[0]
-        angle = float(np.angle(np.mean(np.exp(1j * form.angle[own]))))
-        x, y, z = form.points_at(np.array([np.median(form.along_mm[own])]), np.array([angle]))[0]
+        angle = float(np.angle(np.mean(np.exp(1j * form.angle[members]))))
+        x, y, z = form.points_at(np.array([np.median(form.along_mm[members])]), np.array([angle]))[0]
         return (
             f"a second body joins the pipe at ({x:.1f}, {y:.1f}, {z:.1f}) mm and rises {high.max():.3g} mm from it: "
             f"its region, {along:.3g} mm along the pipe and {around:.0f} deg around it, is not inspected"
@@ -236,10 +236,10 @@ def _find_largest_cylinder(points: np.ndarray) -> Cylinder | None:
 def _refuse_coarse(cloud: PointCloud, form: PipeForm) -> None:
     points = cloud.points_mm
     near: Any = KDTree(points).query(thin_evenly(points, _Rule.bend_points), k=4, workers=-1)
-    apart = float(np.median(near[0][:, 3]))
-    if apart > _Rule.coarse * form.radius_mm:
+    spacing = float(np.median(near[0][:, 3]))
+    if spacing > _Rule.coarse * form.radius_mm:
         raise EvaluationError(
-            f"the cloud is too coarse for a pipe: {apart:.3g} mm between its points, on a radius of about "
+            f"the cloud is too coarse for a pipe: {spacing:.3g} mm between its points, on a radius of about "
             f"{form.radius_mm:.3g} mm; at most {_Rule.coarse * form.radius_mm:.2g} mm are expected"
         )
 
@@ -307,9 +307,9 @@ def _refine_torus(places: np.ndarray, point: np.ndarray, direction: np.ndarray) 
     def meridian(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         axis = direction + x[2:4] @ across
         axis = axis / np.linalg.norm(axis)
-        away = places - point - x[:2] @ across
-        height = away @ axis
-        return np.linalg.norm(away - np.outer(height, axis), axis=1), height, away
+        distance = places - point - x[:2] @ across
+        height = distance @ axis
+        return np.linalg.norm(distance - np.outer(height, axis), axis=1), height, distance
 
     out, height, _ = meridian(np.zeros(4))
     try:
@@ -330,7 +330,7 @@ def _refine_torus(places: np.ndarray, point: np.ndarray, direction: np.ndarray) 
         x = np.asarray(least_squares(residuals, x, loss="cauchy", f_scale=2 * limit, max_nfev=60).x)
     left = residuals(x)
     on = np.abs(left) < 5 * max(robust_std(left), 1e-9)
-    away = meridian(x)[2][on]
-    turned = np.arctan2(*(away @ across.T).T)
+    distance = meridian(x)[2][on]
+    turned = np.arctan2(*(distance @ across.T).T)
     turned = np.angle(np.exp(1j * (turned - np.angle(np.mean(np.exp(1j * turned))))))
     return float(x[4]), float(x[6]), float(np.ptp(turned)), robust_std(left)

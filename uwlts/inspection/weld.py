@@ -201,13 +201,13 @@ def build_bead(
     if not np.isfinite(means).any():
         raise EvaluationError(f"none of the {count} sections across the bead has enough points for a profile")
     seen = MAD_TO_STD * float(np.nanmedian(np.abs(means) / expected))
-    scatter = _local_scatter(profiles, raw, across, bandwidth)
+    scatter = _estimate_scatter(profiles, raw, across, bandwidth)
     seen = seen * np.maximum(scatter / float(np.median(scatter[np.abs(across) > half * (1 + _Rule.groove_outside)])), 1)
     on_bead = np.abs(across) < half
     return Bead(chosen, raw, heights, on_bead, half, length, gap, seen, profiles, footprint_std)
 
 
-def _local_scatter(profiles: BeadProfiles, raw: np.ndarray, across: np.ndarray, bandwidth: float) -> np.ndarray:
+def _estimate_scatter(profiles: BeadProfiles, raw: np.ndarray, across: np.ndarray, bandwidth: float) -> np.ndarray:
     """Estimate the scatter (n,) of the points about the profiles, by their place across the weld."""
     depths = profiles.evaluate(raw).ravel()
     whole = abs(profiles.sharp) @ ~np.isfinite(depths) < NO_WEIGHT
@@ -215,9 +215,9 @@ def _local_scatter(profiles: BeadProfiles, raw: np.ndarray, across: np.ndarray, 
     cell = ((across - across.min()) / (2 * bandwidth)).astype(int)
     spread = np.full(cell.max() + 1, np.nan)
     for k in range(len(spread)):
-        own = off[(cell == k) & whole]
-        if len(own) >= _Rule.fewest_beside:
-            spread[k] = MAD_TO_STD * float(np.median(own))
+        deviations = off[(cell == k) & whole]
+        if len(deviations) >= _Rule.fewest_beside:
+            spread[k] = MAD_TO_STD * float(np.median(deviations))
     if not np.isfinite(spread).any():
         raise EvaluationError(
             f"no strip of {2 * bandwidth:.2g} mm along the weld has {_Rule.fewest_beside} points of complete sections, "

@@ -20,7 +20,7 @@ from pydantic import (
 from uwlts.argument_types import check_arguments
 from uwlts.errors import describe_problems
 from uwlts.files.json_files import add_seal, numbers_in, write_model
-from uwlts.files.writing import require_ending, write_atomically
+from uwlts.files.writing import require_ending, write_file
 from uwlts.model.joint_estimate import JointEstimate, Origin
 from uwlts.model.parameter_keys import SheetParameter
 from uwlts.model.sensor import (
@@ -83,7 +83,7 @@ class CameraModel(Description):
 
     @classmethod
     def from_description(cls, camera: Camera, *, magnified: float = 1.0) -> "CameraModel":
-        """Return a camera as described, with the focal length times ``magnified`` by refraction.
+        """Return the described camera; refraction multiplies its focal length by ``magnified``.
 
         If the focal length is magnified, the distortion is unknown and set to zero.
         """
@@ -368,8 +368,7 @@ class PolynomialCalibration(Brief, Description):
         require_ending(Path(path), (".json",))
         content = add_seal({"format": POLYNOMIALS_FORMAT, "version": VERSION} | self.model_dump(mode="json"))
         lines = ",\n".join(f"  {json.dumps(key)}: {json.dumps(value)}" for key, value in content.items())
-        with write_atomically(path, overwrite=overwrite) as aside:
-            aside.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
+        write_file(path, f"{{\n{lines}\n}}\n", overwrite=overwrite)
 
     def figures(self, step: str) -> Table:
         """Return the figures of a calibration step; an empty table if there are none."""

@@ -55,7 +55,7 @@ class Level:
     """One description of a chain of bases: its name, its own table, and the table merged with those of its bases."""
 
     name: str
-    own: Table
+    stated: Table
     merged: Table
 
 
@@ -122,8 +122,8 @@ def merge_tables(base: Table, changes: Table) -> Table:
     replaced = {
         key
         for ways in _EITHER_OR
-        for said, other in (ways, ways[::-1])
-        if said & changes.keys() and not other & changes.keys()
+        for stated, other in (ways, ways[::-1])
+        if stated & changes.keys() and not other & changes.keys()
         for key in other
     }
     result = {key: value for key, value in base.items() if key not in replaced}
@@ -138,11 +138,11 @@ def validate_description(model: type[AnyDescription], table: object, source: str
     try:
         return model.model_validate(table)
     except ValidationError as error:
-        words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", model.__name__).lower()
+        text = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", model.__name__).lower()
         known = [_explain(each, model) for each in list_problems(error, _MOST_PROBLEMS)]
         left = error.error_count() - len(known)
         more = [f"  {left:,} {'more ' if known else ''}values are wrong"] if left else []
-        raise DescriptionError("\n".join([f"{source} is not a valid {words}:", *known, *more])) from error
+        raise DescriptionError("\n".join([f"{source} is not a valid {text}:", *known, *more])) from error
     except Error as error:
         raise type(error)(f"{source}: {error}") from error
     except ArithmeticError as error:
@@ -252,7 +252,7 @@ class _Inherited:
 
     def origin(self, path: str) -> Level | None:
         """Return the level that an inherited value is from; None for a value of the last level and for a default."""
-        set_by = [level for level in self._levels if _value(level.own, path) is not None]
+        set_by = [level for level in self._levels if _value(level.stated, path) is not None]
         if not set_by or set_by[-1] is self._last or _value(self._last.merged, path) is None:
             return None
         return set_by[-1]
@@ -295,7 +295,7 @@ def find_misfits(levels: Sequence[Level], sensor: Sensor) -> list[str]:
     ``levels`` lead from the first base to the description itself. Only its own ``volume`` is checked, too.
     """
     inherited = _Inherited(levels)
-    own = "state it in this description"
+    advice = "state it in this description"
     found = inherited.say("name", _PARTS, "", "give this sensor its own name, because calibrations are compared by it")
     found += inherited.say("notes", _PARTS, "", "describe this sensor, or set notes to an empty text")
     found += _check_places(inherited, sensor)
@@ -305,7 +305,7 @@ def find_misfits(levels: Sequence[Level], sensor: Sensor) -> list[str]:
     if isinstance(old_nm, int | float) and old_nm > 0:
         scaled = radius * sensor.laser.wavelength_nm / old_nm
         misfit = f"; the same line optics focus {nm} to {scaled:.3g} mm"
-        found += inherited.say("laser.waist_radius_mm", [_WAVELENGTH], misfit, own)
+        found += inherited.say("laser.waist_radius_mm", [_WAVELENGTH], misfit, advice)
     for path in _AT_WAVELENGTH:
         if not isinstance(_value(levels[-1].merged, path), str):
             material = ", or name a material such as 'N-BK7'" if path.endswith("glass") else ""
@@ -345,22 +345,22 @@ def _check_places(inherited: _Inherited, sensor: Sensor) -> Iterator[str]:
             f"set it to the apparent distance in mm of the stand-off ({places}), and f_number ({camera.f_number:g})"
         )
         yield from inherited.say("camera.focus_distance_mm", [*_PLACEMENT, *_LENS, *window, *media], misfit, advice)
-    away = float(np.linalg.norm(laser_pose(sensor).origin_mm - (0.0, 0.0, standoff)))
+    distances_ = float(np.linalg.norm(laser_pose(sensor).origin_mm - (0.0, 0.0, standoff)))
     index = max(indices.values(), default=1.0)
     rayleigh = math.pi * laser.waist_radius_mm**2 * index / (laser.beam_quality_m2 * 1e-6 * laser.wavelength_nm)
-    thicker = math.hypot(1.0, (away - laser.waist_distance_mm) / rayleigh)
+    thicker = math.hypot(1.0, (distances_ - laser.waist_distance_mm) / rayleigh)
     if thicker > _THICKER:
         misfit = f"; at the stand-off the sheet is {thicker:.2f} times as thick as in its waist"
         depends_on = [*_PLACEMENT, _WAVELENGTH, "laser.waist_radius_mm", "laser.beam_quality_m2", *media]
-        advice = f"set it to the laser's distance from the stand-off, {away:.1f}"
+        advice = f"set it to the laser's distance from the stand-off, {distances_:.1f}"
         yield from inherited.say("laser.waist_distance_mm", depends_on, misfit, advice)
     outside = standoff - camera.window.distance_mm - camera.window.thickness_mm
     if not volume.near_mm <= outside <= volume.far_mm:
         misfit = f"the stand-off, {outside:.1f} mm from the window, is outside the measuring volume"
         advice, depends_on = "set near_mm and far_mm about the stand-off", [*_PLACEMENT, *window]
         keys = "volume.near_mm", "volume.far_mm"
-        said = [text for key in keys for text in inherited.say(key, depends_on, f"; {misfit}", advice)]
-        yield (said or [f"{inherited.name}: {misfit} of {volume.near_mm:g} to {volume.far_mm:g} mm: {advice}"])[0]
+        texts = [text for key in keys for text in inherited.say(key, depends_on, f"; {misfit}", advice)]
+        yield (texts or [f"{inherited.name}: {misfit} of {volume.near_mm:g} to {volume.far_mm:g} mm: {advice}"])[0]
 
 
 def _apparent_mm(window: Window, distance_mm: float, *, index: float, wavelength_nm: float) -> float:
@@ -375,13 +375,13 @@ def _check_medium(inherited: _Inherited, name: str, nm: str) -> Iterator[str]:
     """Yield warnings about inherited optical constants of a medium."""
     at = f"media.{name}"
     kind = f"{at}.kind"
-    own = {
+    stated = {
         "index": [kind, f"{at}.temperature_c", f"{at}.salinity_g_kg"],
         "absorption_per_m": [kind, f"{at}.water", f"{at}.turbidity"],
         "scattering_per_m": [kind, f"{at}.water", f"{at}.turbidity"],
         "phase": [kind, f"{at}.water", f"{at}.turbidity"],
     }
-    for key, depends_on in own.items():
+    for key, depends_on in stated.items():
         misfit = "; it replaces the value that follows from them"
         advice = f"set the value of this medium at {nm}, or give the medium another name"
         of_medium = [*inherited.say(f"{at}.{key}", depends_on, misfit, advice)]

@@ -72,7 +72,7 @@ class Glass:
     strength_source: str = ""
 
 
-def _sellmeier(strengths: tuple[float, ...], poles_um2: tuple[float, ...]) -> Callable[[float], float]:
+def _evaluate_sellmeier(strengths: tuple[float, ...], poles_um2: tuple[float, ...]) -> Callable[[float], float]:
     """Return Sellmeier's formula n^2 = 1 + sum B L^2 / (L^2 - C), with L in um and C in um^2."""
     return lambda um: math.sqrt(1 + sum(b * um**2 / (um**2 - c) for b, c in zip(strengths, poles_um2, strict=True)))
 
@@ -82,10 +82,10 @@ def _soda_lime(um: float) -> float:
     return 1.5130 - 0.003169 * um**2 + 0.003962 / um**2
 
 
-_BK7 = _sellmeier((1.03961212, 0.231792344, 1.01046945), (0.00600069867, 0.0200179144, 103.560653))
-_SAPPHIRE = _sellmeier((1.4313493, 0.65054713, 5.3414021), (0.0726631**2, 0.1193242**2, 18.028251**2))
+_BK7 = _evaluate_sellmeier((1.03961212, 0.231792344, 1.01046945), (0.00600069867, 0.0200179144, 103.560653))
+_SAPPHIRE = _evaluate_sellmeier((1.4313493, 0.65054713, 5.3414021), (0.0726631**2, 0.1193242**2, 18.028251**2))
 """Ordinary ray, that of a window whose optical axis is normal to its faces; the other index is lower by 0.008."""
-_SILICA = _sellmeier((0.6961663, 0.4079426, 0.8974794), (0.0684043**2, 0.1162414**2, 9.896161**2))
+_SILICA = _evaluate_sellmeier((0.6961663, 0.4079426, 0.8974794), (0.0684043**2, 0.1162414**2, 9.896161**2))
 
 FUSED_SILICA_MPA = 60.0
 """Fracture strength that is used for windows of unknown strength, as in the thesis (Figure 34, after Harris 1999)."""
@@ -102,7 +102,7 @@ GLASSES = {
     "soda-lime": Glass(_soda_lime, 0.31, 4.6, 14.5, "Rubin 1985, clear", *_FLOAT_GLASS),
     "soda-lime-low-iron": Glass(_soda_lime, 0.31, 4.6, 3.25, "Rubin 1985, low iron", *_FLOAT_GLASS),
     "sapphire": Glass(_SAPPHIRE, 0.2, 5.0, 0.0, "Malitson and Dodge 1972", *_SAPPHIRE_LIMIT),
-    "PMMA": Glass(_sellmeier((1.1819,), (0.011313,)), 0.4368, 1.052, 0.0, "Sultanova 2009", *_CAST_ACRYLIC),
+    "PMMA": Glass(_evaluate_sellmeier((1.1819,), (0.011313,)), 0.4368, 1.052, 0.0, "Sultanova 2009", *_CAST_ACRYLIC),
 }
 
 

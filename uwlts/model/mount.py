@@ -124,8 +124,8 @@ class Mount(Brief, Description):
         if not np.abs(covariance - covariance.T).max() <= 1e-9 * np.abs(covariance).max():
             raise ValueError("covariance must be a symmetric 6x6 matrix")
         if self.sensor is not None:
-            by, apart = self.sensor.by_parameters, self.sensor.covariance_apart
-            if len(by) != 6 or len({*map(len, by)}) != 1 or [*map(len, apart)] != [6] * 6:
+            by, independent = self.sensor.by_parameters, self.sensor.covariance_apart
+            if len(by) != 6 or len({*map(len, by)}) != 1 or [*map(len, independent)] != [6] * 6:
                 raise ValueError("sensor must have by_parameters (6, P) and covariance_apart (6, 6)")
         if not np.all(np.delete(np.diag(covariance), (2, 5) if self.table else ()) > 0):
             raise ValueError("covariance must have positive variances")

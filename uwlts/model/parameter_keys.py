@@ -37,9 +37,9 @@ class _SingleParameter(Enum):
     text: str
     quantity: ParameterLabel
 
-    def __init__(self, text: str, words: str, unit: str = "", factor: float = 1.0):
+    def __init__(self, text: str, label: str, unit: str = "", factor: float = 1.0):
         self.text = text
-        self.quantity = ParameterLabel(words, unit, factor)
+        self.quantity = ParameterLabel(label, unit, factor)
 
 
 class LensParameter(_SingleParameter):

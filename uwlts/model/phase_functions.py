@@ -83,8 +83,8 @@ class HenyeyGreenstein(PhaseFunction):
         The bracket is written as a sum of squares, which avoids cancellation at the forward (g > 0) or backward peak.
         """
         g = self.asymmetry
-        away = np.sin(angle / 2) if g >= 0 else np.cos(angle / 2)
-        return (1 - g * g) / (4 * math.pi) * ((1 - abs(g)) ** 2 + 4 * abs(g) * away**2) ** -1.5
+        half = np.sin(angle / 2) if g >= 0 else np.cos(angle / 2)
+        return (1 - g * g) / (4 * math.pi) * ((1 - abs(g)) ** 2 + 4 * abs(g) * half**2) ** -1.5
 
 
 @validated_dataclass(frozen=True, config=_STRICT)
@@ -156,7 +156,7 @@ class FournierForand(PhaseFunction):
         h = np.sin(angle / 2) ** 2
         v, whole = (3 - self.slope) / 2, 4 / (3 * (self.index - 1) ** 2)
         d = whole * h
-        s = _second_remainder(d, v)
+        s = _expand_remainder(d, v)
         around = (1 - whole**v) * (3 * np.cos(angle) ** 2 - 1) / (16 * math.pi * (whole - 1) * whole**v)
         return (s - (v + d * s) / h) / (4 * math.pi * d**v) + around
 
@@ -172,7 +172,7 @@ class FournierForand(PhaseFunction):
         return (1 - d ** (v + 1) - (1 - d**v) * h) / ((1 - d) * d**v) + around
 
 
-def _second_remainder(d: np.ndarray, v: float) -> np.ndarray:
+def _expand_remainder(d: np.ndarray, v: float) -> np.ndarray:
     """Return (v (1 - d) - (1 - d^v)) / (1 - d)^2, near d = 1 by the binomial series of d^v."""
     x = 1 - d
     # The remainder of the 12 terms is below 0.05^12, less than the rounding error of 64 bits.

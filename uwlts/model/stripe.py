@@ -127,8 +127,8 @@ class StripeCandidates:
         lines = np.flatnonzero(on_line == sheets)
         found = []
         for number in range(sheets):
-            own = self[np.searchsorted(self.line, lines) + number]
-            columns = own.centre_px, own.amplitude, own.width_px
+            chosen = self[np.searchsorted(self.line, lines) + number]
+            columns = chosen.centre_px, chosen.amplitude, chosen.width_px
             found.append(Stripe.from_lines(lines, *columns, status=status.copy(), stripe_along=self.stripe_along))
         return found
 

@@ -97,13 +97,13 @@ def _offsets(calibration: AnyCalibration) -> set[tuple[int, int]]:
 
 
 def _check_same_refraction(header: CaptureHeader, calibration: PolynomialCalibration, *, source: str) -> None:
-    own = calibration.medium
-    index, own_index = calibration.medium_index(header.medium), calibration.medium_index(own)
-    if header.medium.kind != own.kind or abs(index - own_index) > _LARGEST_INDEX_CHANGE:
+    medium = calibration.medium
+    index, own_index = calibration.medium_index(header.medium), calibration.medium_index(medium)
+    if header.medium.kind != medium.kind or abs(index - own_index) > _LARGEST_INDEX_CHANGE:
         raise CalibrationError(
             f"{source} was made in {header.medium_name} ({header.medium.kind}, n {index:.4f}), the "
-            f"polynomials in {calibration.medium_name} ({own.kind}, n {own_index:.4f}): polynomials are valid only in "
-            "the medium of their calibration; calibrate again in this one"
+            f"polynomials in {calibration.medium_name} ({medium.kind}, n {own_index:.4f}): polynomials are valid only "
+            "in the medium of their calibration; calibrate again in this one"
         )
     if header.sensor.camera.window.mounted != calibration.window_mounted:
         here, there = ("without", "with") if calibration.window_mounted else ("with", "without")

@@ -62,7 +62,7 @@ class LineTable:
             if not np.isfinite(values).all():
                 return None
             # Axes: term of the line, term of the place, value.
-            into_lines, into_places = map(_into_series, count)
+            into_lines, into_places = map(_make_series_matrix, count)
             series = np.tensordot(into_places, values.reshape(*count[::-1], -1), (1, 0))
             series = np.tensordot(into_lines, series, (1, 1))
             error = np.maximum(tolerance, share * np.abs(values).max(axis=0))
@@ -139,7 +139,7 @@ class LineTable:
 _tables: dict[Hashable, LineTable | None] = {}
 
 
-def _into_series(count: int) -> np.ndarray:
+def _make_series_matrix(count: int) -> np.ndarray:
     """Return the matrix from values at ``count`` Chebyshev nodes to coefficients of the series."""
     into_series = 2.0 / count * chebyshev.chebvander(chebyshev.chebpts1(count), count - 1).T
     into_series[0] *= 0.5

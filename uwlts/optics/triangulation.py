@@ -100,10 +100,10 @@ def fan_distances(points: np.ndarray, fan: FanModel, *, medium_index: float) -> 
     """Return the distances of points (3, N) from a fan's apparent origin, which in a medium is behind the true one."""
     axis = np.array(fan.axis)
     behind = medium_index * behind_window_mm(fan)
-    away = points - (np.array(fan.pivot_mm) - behind * axis)[:, None]
-    along, square = axis @ away, np.einsum("in,in->n", away, away)
+    offset = points - (np.array(fan.pivot_mm) - behind * axis)[:, None]
+    along, square = axis @ offset, np.einsum("in,in->n", offset, offset)
     in_air = np.sqrt(np.maximum(medium_index**2 * along**2 - (medium_index**2 - 1.0) * square, _GRAZING * square))
-    return FanDistances(away, np.sqrt(square), along, in_air, 1.0 - behind / along)
+    return FanDistances(offset, np.sqrt(square), along, in_air, 1.0 - behind / along)
 
 
 def behind_window_mm(fan: FanModel) -> float:

@@ -158,9 +158,9 @@ def trace_window(directions: np.ndarray, window: WindowModel | None, *, medium_i
     if window is None:
         origins = np.zeros_like(directions)
     else:
-        away = cosine <= 0
-        status[away] = RayStatus.BEHIND_WINDOW
-        cosine[away] = np.nan
+        backwards = cosine <= 0
+        status[backwards] = RayStatus.BEHIND_WINDOW
+        cosine[backwards] = np.nan
         origins = (window.distance_mm * normal[2] / cosine * directions.T).T
         index = 1.0
         if window.refractions == 2:

@@ -84,8 +84,8 @@ def render_page(package: str, template: str, /, *, interactive: FigureCollector 
     are embedded only if there are interactive figures. Every template knows the ``software`` and its version.
     """
     templates = Path(__file__).with_name("templates")
-    own = Path(str(files(package)))
-    loader = FileSystemLoader([own, own / "templates", templates])
+    folder = Path(str(files(package)))
+    loader = FileSystemLoader([folder, folder / "templates", templates])
     environment = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters["minus"] = typeset_number
     components = environment.get_template("components.html.j2").module
@@ -316,15 +316,15 @@ def print_pdf(page: str, path: Path, *, overwrite: bool = False) -> None:
         source = Path(folder) / "page.html"
         source.write_text(page, encoding="utf-8", errors="replace")
         # The page is the program's own and loads nothing; root cannot use the sandbox.
-        words = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder}/profile"]
-        words += ["--no-pdf-header-footer", f"--print-to-pdf={aside.absolute()}", source.as_uri()]
+        flags = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder}/profile"]
+        flags += ["--no-pdf-header-footer", f"--print-to-pdf={aside.absolute()}", source.as_uri()]
         try:
-            done = subprocess.run([browser, *words], capture_output=True, text=True, timeout=_PATIENCE_S, check=False)
+            done = subprocess.run([browser, *flags], capture_output=True, text=True, timeout=_PATIENCE_S, check=False)
         except (OSError, subprocess.TimeoutExpired) as error:
             raise SetupError(f"{browser} cannot print {path.name}: {error}") from error
         if not aside.stat().st_size:
-            said = " ".join(done.stderr.split())[-300:]
-            raise SetupError(f"{browser} has not printed {path.name} (exit status {done.returncode}): {said}")
+            message = " ".join(done.stderr.split())[-300:]
+            raise SetupError(f"{browser} has not printed {path.name} (exit status {done.returncode}): {message}")
 
 
 def find_browser() -> str:

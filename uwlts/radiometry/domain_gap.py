@@ -115,7 +115,7 @@ class DomainGap(Brief):
 
     def covered_table(self) -> tuple[list[str], list[list[str]]]:
         """Return heading and rows of the table of covered real windows, in percent, and of the gaps by statistic."""
-        pairs = [each for each in self.gaps if each.name in {own.name for own in self.generated}]
+        pairs = [each for each in self.gaps if each.name in {one.name for one in self.generated}]
         rows = [
             [
                 each.name,
@@ -131,7 +131,7 @@ class DomainGap(Brief):
         rows = [
             [
                 f"{each.name} {each.unit}".rstrip(),
-                *(", ".join(f"{x:.3g}" for x in np.quantile(own.values[:, k], QUANTILES)) for own in self.sets()),
+                *(", ".join(f"{x:.3g}" for x in np.quantile(one.values[:, k], QUANTILES)) for one in self.sets()),
             ]
             for k, each in enumerate(STATISTICS)
         ]
@@ -188,13 +188,13 @@ def measure_domain_gap(
     sources = [*generated, *real]
     found = []
     for number, source in enumerate(sources):
-        own = measure_windows(open_image_set(source, stripe=stripe), most_images=most_images)
-        if len(own.values) < _FEWEST_WINDOWS:
+        windows = measure_windows(open_image_set(source, stripe=stripe), most_images=most_images)
+        if len(windows.values) < _FEWEST_WINDOWS:
             raise CaptureError(
-                f"{source} shows {len(own.values)} pieces of a stripe {WINDOW_LINES} lines long; expected "
+                f"{source} shows {len(windows.values)} pieces of a stripe {WINDOW_LINES} lines long; expected "
                 f"{_FEWEST_WINDOWS} or more: give more images"
             )
-        found.append(own)
+        found.append(windows)
         progress(number + 1, len(sources), "statistics")
     names = [each.name for each in found]
     found = [
@@ -206,10 +206,10 @@ def measure_domain_gap(
     return DomainGap(ours, theirs, tuple(_set_gap(*pair) for pair in pairs), tuple(map(_floor, theirs)))
 
 
-def _set_gap(own: StripeWindows, real: StripeWindows) -> SetGap:
-    x, y = _thinned(own), _thinned(real)
-    p, q = _to_quantiles(x.values, y.values)
-    low, high = np.quantile(own.values, _COVERED, axis=0)
+def _set_gap(generated: StripeWindows, real: StripeWindows) -> SetGap:
+    x, y = _thin(generated), _thin(real)
+    p, q = _replace_by_quantiles(x.values, y.values)
+    low, high = np.quantile(generated.values, _COVERED, axis=0)
     inside = (real.values >= low) & (real.values <= high)
     names = [each.name for each in STATISTICS]
     values, starts = np.vstack([p, q]), np.append(_group_starts(x.image), len(p) + _group_starts(y.image))
@@ -219,7 +219,7 @@ def _set_gap(own: StripeWindows, real: StripeWindows) -> SetGap:
     left = [[whole.coefficient(first[first != group], second) for group in first]]
     left.append([whole.coefficient(first, second[second != group]) for group in second])
     return SetGap(
-        own.name,
+        generated.name,
         real.name,
         whole.coefficient(first, second),
         math.sqrt(sum(float(jackknife((np.array(each) - np.mean(each))[:, None])[0, 0]) for each in left)),
@@ -231,21 +231,21 @@ def _set_gap(own: StripeWindows, real: StripeWindows) -> SetGap:
 
 def _floor(real: StripeWindows) -> GapFloor:
     """Return the gap between random halves of the images of a real set, or of its parts if it has few images."""
-    own, rng = _thinned(real), np.random.default_rng(0)
-    values = _to_quantiles(own.values, own.values)[0]
-    whole = _GroupDistances.between(values, _group_starts(own.image))
+    windows, rng = _thin(real), np.random.default_rng(0)
+    values = _replace_by_quantiles(windows.values, windows.values)[0]
+    whole = _GroupDistances.between(values, _group_starts(windows.image))
     count = len(whole.count)
     halves = [rng.permutation(count) for _ in range(_HALVINGS)]
     gaps = [whole.coefficient(each[: count // 2], each[count // 2 :]) for each in halves]
     return GapFloor(real.name, float(np.mean(gaps)), float(np.std(gaps)))
 
 
-def _thinned(own: StripeWindows) -> StripeWindows:
-    kept = np.unique(np.linspace(0, len(own.values) - 1, min(_MOST_WINDOWS, len(own.values))).astype(int))
-    return StripeWindows(own.name, own.values[kept], own.image[kept], ())
+def _thin(windows: StripeWindows) -> StripeWindows:
+    kept = np.unique(np.linspace(0, len(windows.values) - 1, min(_MOST_WINDOWS, len(windows.values))).astype(int))
+    return StripeWindows(windows.name, windows.values[kept], windows.image[kept], ())
 
 
-def _to_quantiles(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _replace_by_quantiles(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Replace statistics (N, K) and (M, K) by their mid-quantiles in the mixture of both with equal weights."""
 
     def share(values: np.ndarray, among: np.ndarray) -> np.ndarray:

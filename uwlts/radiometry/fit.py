@@ -151,7 +151,7 @@ def fit_radiometry(
         images = measure_stripes(scan, stripes, light.usable, progress)
         evidence, *others = (
             _Evidence.gather(scan.header, known, light, images, phase)
-            for phase in (_described_phase(scan.header), *_OTHER_PHASES)
+            for phase in (_choose_phase(scan.header), *_OTHER_PHASES)
         )
         whole, covariance = evidence.estimate_with_covariance()
         separated = math.sqrt(covariance[1, 1]) < _KNOWN_ATTENUATION
@@ -204,7 +204,7 @@ def fit_radiometry(
             estimates=estimates,
             correlation=correlation,
             parts=parts,
-            not_separable=_not_separable(correlation, by_name, determined, described, float(np.ptp(evidence.paths))),
+            not_separable=_find_inseparable(correlation, by_name, determined, described, float(np.ptp(evidence.paths))),
             outlook=outlook(scan.header, known, by_name, images, determined=determined),
             sources={
                 "capture": describe_source(scan).model_dump(mode="json"),
@@ -274,8 +274,8 @@ class _Evidence:
         core = images.width // 2
         tails, within = [], []
         of_block = map(mean_of_block, (ray, to_laser, to_camera))
-        for own, seen, first, second in zip(sheet_of_block, *of_block, strict=True):
-            kernel = HaloKernel(phase.per_sr, ((first, own), (second, seen)))
+        for of_sheet, seen, first, second in zip(sheet_of_block, *of_block, strict=True):
+            kernel = HaloKernel(phase.per_sr, ((first, of_sheet), (second, seen)))
             middle = int(np.argmin(np.abs(kernel.place_px)))
             step = round(1 / STEP_PX)
             rows = [kernel.profile(1e-3 * b, sigma_px=1.0) for b in nodes]
@@ -456,7 +456,7 @@ def _mean_of(group: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.bincount(group, values) / np.bincount(group)
 
 
-def _described_phase(header: CaptureHeader) -> PhaseFunction:
+def _choose_phase(header: CaptureHeader) -> PhaseFunction:
     """Return the phase function of the medium's particles; Petzold's average particle if none are described."""
     scatterers = header.medium.scatterers(header.sensor.laser.wavelength_nm)
     particles = [each.phase for each in scatterers if each.phase.name != "molecular"]
@@ -481,7 +481,7 @@ def _fit_robustly(design: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, n
     return weight, rest
 
 
-def _not_separable(
+def _find_inseparable(
     correlation: np.ndarray, by_name: dict[str, ImageEstimate], determined: bool, described: float, range_mm: float
 ) -> tuple[str, ...]:
     """Return the quantities that the images do not separate, as text."""

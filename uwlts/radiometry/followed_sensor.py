@@ -60,13 +60,13 @@ def follow_sensor(
     medium = header.medium
     if {"attenuation_per_m", "scattering_per_m"} & value.keys():
         described = 1e3 * medium.scattering_per_mm(sensor.laser.wavelength_nm)
-        medium = _followed_medium(medium, attenuation_per_m, value.get("scattering_per_m", described))
+        medium = _fit_medium(medium, attenuation_per_m, value.get("scattering_per_m", described))
     exposure = sensor.exposure.model_copy(update={"laser_ms": exposure_ms})
     return sensor.model_copy(
         update={
             "exposure": exposure,
             "name": f"{sensor.name}-followed",
-            "camera": _calibrated_camera(sensor, calibration),
+            "camera": _calibrate_camera(sensor, calibration),
             "laser": sensor.laser.model_copy(update=laser),
             "detector": sensor.detector.model_copy(update=detector),
             "media": sensor.media | {header.medium_name: medium},
@@ -74,7 +74,7 @@ def follow_sensor(
     )
 
 
-def _calibrated_camera(sensor: Sensor, calibration: Calibration) -> Any:
+def _calibrate_camera(sensor: Sensor, calibration: Calibration) -> Any:
     camera, model = sensor.camera, calibration.camera
     update: dict[str, Any] = {
         "focal_length_mm": 1e-3 * model.fx_px * camera.pixel_size_um,
@@ -125,7 +125,7 @@ def _waist_radius_mm(laser: Laser, radius_mm: float, distance_mm: float, *, medi
     return float(waists[below[0]]) if radius_mm > 0 and len(below) else None
 
 
-def _followed_medium(medium: Medium, attenuation_per_m: float, scattering_per_m: float) -> Medium:
+def _fit_medium(medium: Medium, attenuation_per_m: float, scattering_per_m: float) -> Medium:
     """Return the medium with fitted absorption and scattering; its phase function is the one of the fit."""
     scattering = max(scattering_per_m, 0.0)
     found = {"absorption_per_m": max(attenuation_per_m - scattering, 0.0), "scattering_per_m": scattering}

@@ -118,12 +118,12 @@ def measure_stripes(
     frames = np.unique(stripes.frame).tolist()
     peaks, clipped = [], 0
     for number, frame in enumerate(frames):
-        own = np.flatnonzero(stripes.frame == frame)
-        line = stripes.line[own]
+        members = np.flatnonzero(stripes.frame == frame)
+        line = stripes.line[members]
         image = capture.image(frame)
         profiles = (image if along == "height" else image.T).astype(np.float32)
-        for run in _runs(line, usable[own]):
-            chosen = own[run]
+        for run in _runs(line, usable[members]):
+            chosen = members[run]
             part = _measure_run(profiles, stripes.line[chosen], stripes.centre_px[chosen], core, CLIPPED * full_dn)
             peaks.append(part.values[:, TAIL_PX])
             if np.mean(part.clipped) > _MOST_CLIPPED:
@@ -262,11 +262,11 @@ def measure_noise(source: Capture) -> CameraNoise | None:
     the images are left out. Returns None without repeated images.
     """
     full_dn = source.header.saturation_dn
-    parts, repeated = [], _repeated(source)
+    parts, repeated = [], _find_repeats(source)
     for numbers in repeated:
         images = np.stack([source.image(number) for number in numbers.tolist()]).astype(np.float32)
         # Particles change the mean of a pixel, but seldom its median.
-        parts.append(np.stack([np.median(images, axis=0), _still_variance(images)]))
+        parts.append(np.stack([np.median(images, axis=0), _measure_variance(images)]))
     if not parts:
         return None
     mean, variance = np.stack(parts, axis=1)
@@ -294,7 +294,7 @@ def measure_noise(source: Capture) -> CameraNoise | None:
     return CameraNoise(whole[0], float(std[0]), dark, variance_std / max(2 * dark, 1e-3), fit)
 
 
-def _still_variance(images: np.ndarray) -> np.ndarray:
+def _measure_variance(images: np.ndarray) -> np.ndarray:
     """Return the variance (H, W) of N repeated images; NaN where it is beyond the usual of equally bright pixels.
 
     Variances of normal noise have a chi-square distribution with N - 1 degrees of freedom. The median of a bin gives
@@ -310,7 +310,7 @@ def _still_variance(images: np.ndarray) -> np.ndarray:
     return np.where(kept, variance * _STILL / float(chi2.cdf(limit, freedom + 2)), np.nan)
 
 
-def _repeated(capture: Capture) -> list[np.ndarray]:
+def _find_repeats(capture: Capture) -> list[np.ndarray]:
     """Return the numbers of successive laser images at the same place and exposure, two or more each."""
     lit = np.flatnonzero(capture.laser_on & capture.has_image)
     moved = (np.diff(capture.stage_mm[lit]) != 0) | (np.diff(capture.exposure_ms[lit]) != 0)

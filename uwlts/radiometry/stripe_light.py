@@ -200,8 +200,8 @@ def _fan_light(
     air divided by half the fan angle. A ray has the angles a in air and m in the medium, and ends at the distance y
     from the axis. The power per length across it is P'(a) / (dy/da cos m).
     """
-    away = point - pose.origin_mm
-    y, z = away @ pose.fan, away @ pose.axis
+    offset = point - pose.origin_mm
+    y, z = offset @ pose.fan, offset @ pose.axis
     inside, glass = (0.0, 0.0), 1.0
     if (window := laser.window).mounted:
         inside, glass = (window.distance_mm, window.thickness_mm), window.index(laser.wavelength_nm)

@@ -134,7 +134,7 @@ def _open_files(path: Path, stripe: StripeSettings) -> ImageSet:
         for channel in range(len(channels))
         for along in ("height", "width")
     ]
-    lengths = [_smooth_length(channels[channel], along, own, full) for channel, along, own in tried]
+    lengths = [_smooth_length(channels[channel], along, stripe_of, full) for channel, along, stripe_of in tried]
     if not max(lengths):
         raise ImageError(f"no stripe is found in {files[0]}; expected images with the laser on")
     channel, along, options = tried[int(np.argmax(lengths))]
@@ -222,15 +222,15 @@ def measure_windows(images: ImageSet, *, most_images: int) -> StripeWindows:
             image, stripe_along=images.stripe_along, options=images.options, saturation=images.full_dn
         )
         profiles = (image if images.stripe_along == "height" else image.T).astype(np.float32) / images.full_dn
-        own = []
+        windows = []
         for lines in _windows(stripe, images.options.jump_px):
             found = _measure(profiles[lines], stripe, lines)
             if found is not None:
                 values.append(found)
                 numbers.append(number)
-                own.append(lines)
-        chosen = np.unique(np.linspace(0, max(len(own) - 1, 0), _PICTURES).astype(int))
-        pictures += [_picture(profiles, stripe, own[k]) for k in chosen.tolist() if own]
+                windows.append(lines)
+        chosen = np.unique(np.linspace(0, max(len(windows) - 1, 0), _PICTURES).astype(int))
+        pictures += [_cut_picture(profiles, stripe, windows[k]) for k in chosen.tolist() if windows]
     table = np.array(values).reshape(-1, len(STATISTICS))
     return StripeWindows(images.name, table, np.array(numbers, int), tuple(pictures))
 
@@ -238,8 +238,8 @@ def measure_windows(images: ImageSet, *, most_images: int) -> StripeWindows:
 def _windows(stripe: Stripe, jump_px: float) -> Iterator[np.ndarray]:
     """Yield the lines (`WINDOW_LINES`,) of all windows."""
     found = stripe.lines
-    apart = (np.diff(found) > LONGEST_GAP + 1) | (np.abs(np.diff(stripe.centre_px[found])) > jump_px)
-    for run in np.split(found, np.flatnonzero(apart) + 1):
+    gaps = (np.diff(found) > LONGEST_GAP + 1) | (np.abs(np.diff(stripe.centre_px[found])) > jump_px)
+    for run in np.split(found, np.flatnonzero(gaps) + 1):
         if len(run):
             for first in range(int(run[0]), int(run[-1]) + 2 - WINDOW_LINES, WINDOW_LINES):
                 yield np.arange(first, first + WINDOW_LINES)
@@ -252,8 +252,8 @@ def _measure(profiles: np.ndarray, stripe: Stripe, lines: np.ndarray) -> list[fl
         return None
     profiles, centre = profiles[held], stripe.centre_px[lines[held]]
     width = float(np.median(stripe.width_px[lines[held]]))
-    away = np.abs(np.arange(profiles.shape[1]) - centre[:, None]) / width
-    within, near, far = away <= _STRIPE, (away > _NEAR[0]) & (away < _NEAR[1]), (away > _FAR[0]) & (away < _FAR[1])
+    dist = np.abs(np.arange(profiles.shape[1]) - centre[:, None]) / width
+    within, near, far = (dist <= _STRIPE, (dist > _NEAR[0]) & (dist < _NEAR[1]), (dist > _FAR[0]) & (dist < _FAR[1]))
     if not near.any() or np.count_nonzero(far) < far.shape[0]:
         return None
     background, beside = float(np.median(profiles[far])), float(np.median(profiles[near]))
@@ -290,7 +290,7 @@ def _measure(profiles: np.ndarray, stripe: Stripe, lines: np.ndarray) -> list[fl
     ]
 
 
-def _picture(profiles: np.ndarray, stripe: Stripe, lines: np.ndarray) -> np.ndarray:
+def _cut_picture(profiles: np.ndarray, stripe: Stripe, lines: np.ndarray) -> np.ndarray:
     """Return a window (2 `_CROP_PX` + 1, `WINDOW_LINES`) about the stripe, which runs along the width."""
     middle = round(float(np.nanmedian(stripe.centre_px[lines])))
     place = middle + np.arange(-_CROP_PX, _CROP_PX + 1)

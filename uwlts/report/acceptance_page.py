@@ -88,7 +88,7 @@ def acceptance_page(acceptance: Acceptance) -> str:
 
 
 def _characteristic_row(each: Characteristic) -> tuple[str, ...]:
-    words, guideline = NAMES[each.symbol]
+    text, guideline = NAMES[each.symbol]
     worst = each.worst
     value = MISSING if worst is None else format_fixed(worst.value_mm, 4, signed=each.symbol in _SIGNED)
     expanded = MISSING if worst is None or worst.expanded_mm is None else format_fixed(worst.expanded_mm, 4)
@@ -103,8 +103,8 @@ def _position_row(number: int, each: JudgedPosition, measured: Sequence[Symbol])
     state = f"{each.state}: {each.reason}" if each.reason else each.state
     values = []
     for symbol in measured:
-        own = [value.value_mm for value in each.values if value.symbol == symbol]
-        shown = [format_fixed(value, 4, signed=symbol in _SIGNED).replace("-", "\N{MINUS SIGN}") for value in own]
+        matching = [value.value_mm for value in each.values if value.symbol == symbol]
+        shown = [format_fixed(value, 4, signed=symbol in _SIGNED).replace("-", "\N{MINUS SIGN}") for value in matching]
         values.append(" / ".join(shown) or MISSING)
     points = f"{each.on_artefact:,} of {each.points:,}; {each.rejected}" if each.points else MISSING
     return f"{number}", each.name, each.artefact, state, points, *values
@@ -137,8 +137,8 @@ def _draw_limits(acceptance: Acceptance) -> Markup:
     limited = [each for each in acceptance.characteristics if each.mpe_mm is not None]
     figure, (axes,) = new_figure(9.0, 0.8 + 0.42 * max(len(limited), 1))
     for row, each in enumerate(reversed(limited)):
-        own = [value for value in acceptance.values if value.symbol == each.symbol]
-        shares = [abs(value.value_mm) / (each.limit_mm(value) or 1.0) for value in own]
+        matching = [value for value in acceptance.values if value.symbol == each.symbol]
+        shares = [abs(value.value_mm) / (each.limit_mm(value) or 1.0) for value in matching]
         axes.plot(shares, [row] * len(shares), "o", markersize=3, color=SOFT, alpha=0.6)
         if each.worst is not None:
             colour = _COLOURS[_DECISIONS.get(each.decision, "open")]

@@ -71,7 +71,7 @@ def write_camera(path: str | Path, camera: CameraCalibration, *, overwrite: bool
         summary=_summary(camera),
         models=models,
         rows=rows,
-        misses=_misses(camera),
+        misses=_plot_residuals(camera),
         pictures=[
             (each.name, each.reason or "used", _thumbnail(camera, each)) for each in (left_out + used)[:_MOST_PICTURES]
         ],
@@ -113,7 +113,7 @@ def _select_used(camera: CameraCalibration) -> list[Photograph]:
     return [each for each in camera.photographs if each.reason is None]
 
 
-def _misses(camera: CameraCalibration) -> Markup:
+def _plot_residuals(camera: CameraCalibration) -> Markup:
     """Plot the residuals of all points over the image, magnified, and the rms of each image."""
     model = camera.lens.solution.model
     used = _select_used(camera)

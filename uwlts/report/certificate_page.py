@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 from uwlts.calibration.joint.observability import list_regions
 from uwlts.calibration.joint.stored_estimate import require_joint
-from uwlts.files.writing import refuse_unsuitable, write_atomically
+from uwlts.files.writing import refuse_unsuitable, write_file
 from uwlts.model.calibration import Calibration
 from uwlts.model.joint_estimate import ImageFit, Origin
 from uwlts.model.parameter_keys import ParameterKey
@@ -104,8 +104,7 @@ def write_certificate(
     sealed = json.dumps(content.in_file(), indent=2, ensure_ascii=False) + "\n"
     if stated is not None:
         xml = digital_certificate(content, stated)
-        with write_atomically(digital, overwrite=overwrite) as aside:
-            aside.write_text(xml, encoding="utf-8")
+        write_file(digital, xml, overwrite=overwrite)
     write_page(page, text, beside=sealed, overwrite=overwrite)
     return page, content
 

@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgb
 
 from uwlts.comparison.change import SurfaceChange
 from uwlts.files.json_files import json_text
-from uwlts.files.writing import require_ending, write_atomically
+from uwlts.files.writing import require_ending, write_file
 from uwlts.pages.toolkit import (
     BLUE,
     COLOURS,
@@ -110,8 +110,7 @@ def _write_places(path: Path, change: SurfaceChange, *, overwrite: bool) -> None
     none = np.zeros(len(change.points_mm), np.float32)
     compressed = path.suffix.lower() == ".laz"
     content = encode_las(change.points_mm, none, fields, colours=colours, compressed=compressed)
-    with write_atomically(path, overwrite=overwrite) as aside:
-        aside.write_bytes(content)
+    write_file(path, content, overwrite=overwrite)
 
 
 def _colours(change: SurfaceChange) -> np.ndarray:
@@ -214,9 +213,9 @@ def _scans(registered: RegisteredScans) -> str:
 
     def draw(axes: Any, first: int, second: int) -> None:
         for scan, name in enumerate(registered.names):
-            own = number == scan
+            members = number == scan
             colour = COLOURS[scan % len(COLOURS)]
-            axes.plot(points[own, first], points[own, second], ",", color=colour, rasterized=True)
+            axes.plot(points[members, first], points[members, second], ",", color=colour, rasterized=True)
             axes.plot([], [], "o", color=colour, label=name)
         if (first, second) == _VIEWS[-1]:
             axes.legend(frameon=False, fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
@@ -351,15 +350,15 @@ def _draw_distributions(found: DomainGap) -> "Figure":
     figure, axes = new_figure(11.0, rows * (0.8 + 0.2 * len(sets)), rows=rows, columns=3)
     for k, (axis, each) in enumerate(zip(axes, STATISTICS, strict=False)):
         boxes = axis.boxplot(
-            [own.values[:, k] for own in sets], whis=(5, 95), showfliers=False, orientation="horizontal", widths=0.6
+            [one.values[:, k] for one in sets], whis=(5, 95), showfliers=False, orientation="horizontal", widths=0.6
         )
-        for number, own in enumerate(sets):
-            colour = RED if own in found.real else BLUE
+        for number, one in enumerate(sets):
+            colour = RED if one in found.real else BLUE
             parts = [boxes["boxes"][number], boxes["medians"][number]]
             parts += boxes["whiskers"][2 * number : 2 * number + 2] + boxes["caps"][2 * number : 2 * number + 2]
             for part in parts:
                 part.set_color(colour)
-        labels = [plain_text(own.name) for own in sets] if k % 3 == 0 else [""] * len(sets)
+        labels = [plain_text(one.name) for one in sets] if k % 3 == 0 else [""] * len(sets)
         axis.set_yticks(range(1, len(sets) + 1), labels)
         axis.invert_yaxis()
         axis.set_xlabel(f"{each.name} / {each.unit}" if each.unit else each.name)
@@ -372,12 +371,12 @@ def _draw_pictures(found: DomainGap) -> str:
     """Draw windows of all sets, one row for each set."""
     sets = found.sets()
     figure, axes = new_figure(11.0, 2.3 * len(sets), rows=len(sets), columns=_MOST_PIECES)
-    for row, own in enumerate(sets):
-        chosen = np.unique(np.linspace(0, len(own.pictures) - 1, _MOST_PIECES).astype(int))
+    for row, one in enumerate(sets):
+        chosen = np.unique(np.linspace(0, len(one.pictures) - 1, _MOST_PIECES).astype(int))
         cells = axes[row * _MOST_PIECES : (row + 1) * _MOST_PIECES]
         for cell in cells:
             cell.set_axis_off()
         for cell, number in zip(cells, chosen.tolist(), strict=False):
-            cell.imshow(np.clip(own.pictures[number], 0, 1) ** _GAMMA, cmap="gray", vmin=0, vmax=1)
-        cells[0].set_title(plain_text(own.name), loc="left")
+            cell.imshow(np.clip(one.pictures[number], 0, 1) ** _GAMMA, cmap="gray", vmin=0, vmax=1)
+        cells[0].set_title(plain_text(one.name), loc="left")
     return png_data_uri(figure, dpi=110)

@@ -113,7 +113,7 @@ class Administration(Description):
     equipment: tuple[Equipment, ...] = ()
 
     @model_validator(mode="after")
-    def _ends_after_its_begin(self) -> "Administration":
+    def _check_times(self) -> "Administration":
         if self.end < self.begin:
             raise ValueError(f"the calibration ends on {self.end}, before it begins on {self.begin}")
         return self
@@ -233,8 +233,8 @@ def _add_results(parent: ET.Element, content: AnyCertificate, stated: Administra
     for row in content.parameters:
         if row.unit not in UNITS:
             raise EvaluationError(f"the unit {row.unit!r} of {row.name} is none of {', '.join(map(repr, UNITS))}")
-        words = f"{row.words} ({row.name}){' in pixels' if row.unit == 'px' else ''}"
-        _quantity(parameters, words, row.value, UNITS[row.unit], None if row.std is None else 2 * row.std)
+        text = f"{row.words} ({row.name}){' in pixels' if row.unit == 'px' else ''}"
+        _quantity(parameters, text, row.value, UNITS[row.unit], None if row.std is None else 2 * row.std)
     if isinstance(content, JointCertificate):
         _add_lengths_and_volume(results, content)
 
@@ -244,16 +244,16 @@ def _add_lengths_and_volume(results: ET.Element, content: JointCertificate) -> N
         lengths = _result(results, "Lengths measured on surfaces of many points")
         points = _result(results, "Lengths between two single points")
         for each in content.lengths:
-            words = f"length of {each.length_mm:g} mm along {each.axis}"
+            text = f"length of {each.length_mm:g} mm along {each.axis}"
             for group, expanded in ((lengths, each.calibration_mm), (points, each.point_mm)):
-                _quantity(group, words, each.length_mm, UNITS["mm"], expanded, "basic_nominalValue")
+                _quantity(group, text, each.length_mm, UNITS["mm"], expanded, "basic_nominalValue")
     if content.validity:
         volume = _result(results, "Volume")
         for region in content.validity:
             ends = {"distance from the pupil": region.camera_depth_mm, "Y": region.y_mm, "Z": region.z_mm}
-            for words, pair in ends.items():
+            for text, pair in ends.items():
                 for end, value in zip(("smallest", "largest"), pair, strict=True):
-                    _quantity(volume, f"{end} {words} in {region.name}", value, UNITS["mm"], None)
+                    _quantity(volume, f"{end} {text} in {region.name}", value, UNITS["mm"], None)
 
 
 def _add_equipment(parent: ET.Element, stated: Administration) -> None:
@@ -271,9 +271,9 @@ def _add_equipment(parent: ET.Element, stated: Administration) -> None:
         ]
         if any(value is not None for _, value, *_ in numbers):
             identifications = _child(equipment, "identifications")
-            for issuer, value, words, kind in numbers:
+            for issuer, value, text, kind in numbers:
                 if value is not None:
-                    _identify(identifications, issuer, value, words, kind)
+                    _identify(identifications, issuer, value, text, kind)
 
 
 def _add_medium(parent: ET.Element, content: JointCertificate) -> None:
@@ -287,19 +287,19 @@ def _add_medium(parent: ET.Element, content: JointCertificate) -> None:
             _quantity(data, "temperature", region.medium.temperature_c, r"\degreecelsius", None, "basic_temperature")
 
 
-def _result(parent: ET.Element, words: str) -> ET.Element:
+def _result(parent: ET.Element, text: str) -> ET.Element:
     result = _child(parent, "result")
-    _text(result, "name", words)
+    _text(result, "name", text)
     return _child(result, "data")
 
 
 def _quantity(
-    parent: ET.Element, words: str, value: float, unit: str, expanded: float | None, kind: str = "basic_measuredValue"
+    parent: ET.Element, text: str, value: float, unit: str, expanded: float | None, kind: str = "basic_measuredValue"
 ) -> None:
     """Add a real quantity of a ``kind`` (refType) with its expanded uncertainty, if known."""
     quantity = _child(parent, "quantity")
     quantity.set("refType", kind)
-    _text(quantity, "name", words)
+    _text(quantity, "name", text)
     real = ET.SubElement(quantity, f"{{{SI}}}real")
     known = expanded is not None and expanded > 0
     ET.SubElement(real, f"{{{SI}}}value").text = _decimal(value, expanded if known else None)
@@ -341,13 +341,13 @@ def _add_contact(parent: ET.Element, contact: Contact) -> None:
             _child(location, name, text)
 
 
-def _identify(parent: ET.Element, issuer: str, value: str, words: str, kind: str | None = None) -> None:
+def _identify(parent: ET.Element, issuer: str, value: str, text: str, kind: str | None = None) -> None:
     identification = _child(parent, "identification")
     if kind is not None:
         identification.set("refType", kind)
     _child(identification, "issuer", issuer)
     _child(identification, "value", value)
-    _text(identification, "name", words)
+    _text(identification, "name", text)
 
 
 def _child(parent: ET.Element, name: str, text: str | None = None) -> ET.Element:

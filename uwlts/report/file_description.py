@@ -170,7 +170,7 @@ def describe(
     name, path = str(path), Path(path)
     endings = [each for each in path.suffixes if each != ".part"]
     if (not endings and not path.is_dir()) or endings[-1:] == [".toml"]:
-        lines = _other_description(path) or sensor_lines(load_sensor(name))
+        lines = _name_description(path) or sensor_lines(load_sensor(name))
     elif endings[-1:] == [".xml"]:
         lines = digital_certificate_lines(path, schema)
     elif endings[-2:] == [".truth", ".h5"] or (endings[-1:] == [".h5"] and read_format(path) == TRUTH):
@@ -183,7 +183,7 @@ def describe(
     return "\n".join(lines)
 
 
-def _other_description(path: Path) -> list[str]:
+def _name_description(path: Path) -> list[str]:
     """Return what a description other than a sensor's is, by its keys; empty for a sensor or none of them."""
     table: dict[str, JsonValue] = {}
     if path.suffix == ".toml" and is_regular_file(path):
@@ -342,10 +342,10 @@ def _image_lines(camera: Mapping[str, JsonValue], sheet: Mapping[str, JsonValue]
             )
             moved = f"{moves:11.2f}" if isinstance(moves, float) else f"{'-':>11}"
             lines.append(f"  {points:6}  {rms:9.3f}  {moved}  {stripe:6}  {outliers:8}  {name}")
-    halves, apart = camera.get("halves"), sheet.get("halves_apart_deg")
+    halves, difference_deg = camera.get("halves"), sheet.get("halves_apart_deg")
     one, two = map(numbers_in, halves) if isinstance(halves, list) and len(halves) == 2 else ({}, {})
     by_half = [f"{name} {one[name]:.6g} and {two[name]:.6g}" for name in one if name in two]
-    by_half += [f"sheets {apart:.3f} deg apart"] if isinstance(apart, float) else []
+    by_half += [f"sheets {difference_deg:.3f} deg apart"] if isinstance(difference_deg, float) else []
     return lines + ([f"by every second image and by the others: {', '.join(by_half)}"] if by_half else [])
 
 

@@ -212,8 +212,8 @@ def _sources(
     certificate: str | Path | None,
 ) -> list[Source]:
     named = cloud.metadata.get("calibration")
-    words = ", ".join(f"{key} {cloud.metadata[key]}" for key in ("sensor", "medium") if cloud.metadata.get(key))
-    sources = [Source("cloud", path.name, hash_file(path), f"{len(cloud):,} points{', ' + words if words else ''}")]
+    text = ", ".join(f"{key} {cloud.metadata[key]}" for key in ("sensor", "medium") if cloud.metadata.get(key))
+    sources = [Source("cloud", path.name, hash_file(path), f"{len(cloud):,} points{', ' + text if text else ''}")]
     for each in captures:
         same = Path(each).name == cloud.metadata.get("capture")
         sources.append(Source("capture", Path(each).name, hash_file(each), "named by the cloud" if same else ""))
@@ -324,9 +324,9 @@ def _conclude(listed: Sequence[Feature], order: FindingOrder, found: Inspection)
     verdicts = [judge_feature(each, order.limits)[0] for each in listed]
     counts = [f"{verdicts.count(each)} × {each}" for each in VERDICTS if each in verdicts]
     worst = min(verdicts, key=VERDICTS.index, default=VERDICTS[-1])
-    said = f"Findings: {', '.join(counts)}." if listed else "No finding."
+    text = f"Findings: {', '.join(counts)}." if listed else "No finding."
     omitted = round(100 * float(np.mean(np.isnan(found.deviation_mm)))) if found.kind == "pipe" else 0
-    return worst, f"{said} {omitted} % of the points are not inspected." if omitted else said
+    return worst, f"{text} {omitted} % of the points are not inspected." if omitted else text
 
 
 def _finding_rows(
@@ -357,8 +357,8 @@ def format_interval(value: FeatureValue) -> str:
     """Return a value with its 95 % coverage interval as text, with two digits of the uncertainty and no unit."""
     half = COVERAGE_FACTOR * value.uncertainty
     if value.bound:
-        words, number = value.bound
-        return f"{words} {format_to_scale(number, max(half, _SMALLEST_MM), digits=2)}"
+        text, number = value.bound
+        return f"{text} {format_to_scale(number, max(half, _SMALLEST_MM), digits=2)}"
     if half <= _SMALLEST:
         return f"{value.value:.4g}"
     shown = format_to_scale(value.value, half, digits=2)
@@ -472,7 +472,7 @@ def _map_coordinates(points: np.ndarray, pipe: Feature | None, middle: np.ndarra
     return np.array([away[:, 2], (np.remainder(angle + np.pi, 2 * np.pi) - np.pi) * pipe["diameter"].value / 2])
 
 
-def _picture(feature: Feature, found: Inspection, cloud: PointCloud) -> str:
+def _plot_finding(feature: Feature, found: Inspection, cloud: PointCloud) -> str:
     """Plot a finding from above with outline, neighbours and scale, and in a section through the deepest point."""
     local = (cloud.points_mm - feature.place_mm) @ feature.axes.T
     half = np.maximum(_AROUND * feature.extent_mm[:2], 2.0)
@@ -490,9 +490,9 @@ def _picture(feature: Feature, found: Inspection, cloud: PointCloud) -> str:
         shown = len(outline) > 0 and bool((np.abs(outline) < [*half, deep]).all(axis=1).any())
         if not shown:
             continue
-        own = other is feature
-        above.plot(*outline[:, :2].T, color=RED if own else INK, linewidth=1.4 if own else 0.9)
-        if not own:
+        current = other is feature
+        above.plot(*outline[:, :2].T, color=RED if current else INK, linewidth=1.4 if current else 0.9)
+        if not current:
             at = np.clip(outline[:, :2].mean(axis=0), -0.85 * half, 0.85 * half)
             above.annotate(other.name, tuple(at), fontsize=8, ha="center", color=INK)
     for place in (feature.hollows_mm - feature.place_mm) @ feature.axes.T:

@@ -70,8 +70,8 @@ def to_frame(result: object) -> DataFrame:
         case Calibration():
             table = [_row(each) for each in parameter_rows(result)]
             if result.joint is None:
-                words, std = "direction of the sheet's normal", result.std().sheet_normal_deg
-                table.append({"name": "sheet_normal", "words": words, "unit": "°", "std": std})
+                text, std = "direction of the sheet's normal", result.std().sheet_normal_deg
+                table.append({"name": "sheet_normal", "words": text, "unit": "°", "std": std})
         case Brief(columns=Mapping() as columns):
             table = columns
         case Mapping():

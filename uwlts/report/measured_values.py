@@ -15,7 +15,7 @@ from pydantic import ConfigDict, Field, computed_field, model_validator
 from uwlts.errors import DescriptionError, EvaluationError
 from uwlts.evaluation.figures import VERDICTS, Verdict, judge_interval
 from uwlts.files.json_files import read_model, write_model
-from uwlts.files.writing import refuse_unsuitable, write_atomically
+from uwlts.files.writing import refuse_unsuitable, write_file
 from uwlts.inspection.features import Feature, FeatureKind, FeatureValue
 from uwlts.inspection.picking import PickedMeasurement
 from uwlts.model.library import read_table, validate_description
@@ -181,8 +181,7 @@ def write_measured(page: str | Path, measured: MeasuredValues, *, title: str, ov
     rows = [each.row() for each in measured.values]
     text = render_page("uwlts.report", "measured.html.j2", title=title, columns=COLUMNS, rows=rows)
     write_model(paths[1], measured, file_format=FORMAT, version=VERSION, overwrite=overwrite)
-    with write_atomically(paths[2], overwrite=overwrite) as aside:
-        aside.write_text(measured.table(), encoding="utf-8")
+    write_file(paths[2], measured.table(), overwrite=overwrite)
     write_page(paths[0], text, overwrite=overwrite)
     return paths
 
@@ -308,8 +307,8 @@ def resolve_datum(datum: FindingDatum, axis: np.ndarray) -> tuple[np.ndarray, np
         )
     across = across / np.linalg.norm(across)
     chosen = [
-        f"{said} ({', '.join(f'{number:.2f}' for number in way + 0.0)})"
-        for said, given, way in (
+        f"{label} ({', '.join(f'{number:.2f}' for number in way + 0.0)})"
+        for label, given, way in (
             ("distances increase along", datum.direction, direction),
             ("12 o'clock is", datum.twelve_o_clock, across),
         )
@@ -327,10 +326,10 @@ def format_place(feature: Feature, whole: Feature | None, start_mm: np.ndarray, 
 
     Raises EvaluationError if the datum's directions do not determine the clock.
     """
-    away = feature.place_mm - (start_mm if datum.place_mm is None else np.array(datum.place_mm))
+    offset = feature.place_mm - (start_mm if datum.place_mm is None else np.array(datum.place_mm))
     if whole is None or whole.kind != FeatureKind.PIPE:
-        return f"X {away[0]:.0f}, Y {away[1]:.0f}", f"{np.linalg.norm(away):.0f}"
+        return f"X {offset[0]:.0f}, Y {offset[1]:.0f}", f"{np.linalg.norm(offset):.0f}"
     axis, up, _ = resolve_datum(datum, whole.axes[2])
     about = feature.place_mm - whole.place_mm
     minutes = round(720 * float(np.arctan2(about @ np.cross(axis, up), about @ up)) / (2 * np.pi)) % 720
-    return f"{minutes // 60 or 12}:{minutes % 60:02d}", f"{round(float(away @ axis))}"
+    return f"{minutes // 60 or 12}:{minutes % 60:02d}", f"{round(float(offset @ axis))}"

@@ -185,7 +185,7 @@ def stripe(
     ax.grid(visible=False)
     if stripe is None or not len(stripe.lines):
         return ax
-    lines = _shown_lines(stripe, enlarged=enlarged)
+    lines = _choose_lines(stripe, enlarged=enlarged)
     centres = stripe.centre_px[lines]
     margin = _AROUND_ENLARGED_PX if enlarged else _AROUND_PX
     left, right = max(0, int(lines.min()) - 2), min(grey.shape[1] - 1, int(lines.max()) + 2)
@@ -203,7 +203,7 @@ def stripe(
     return ax
 
 
-def _shown_lines(stripe: Stripe, *, enlarged: bool) -> np.ndarray:
+def _choose_lines(stripe: Stripe, *, enlarged: bool) -> np.ndarray:
     """Return the image lines shown: all of the stripe, or in the enlarged view adjacent ones with the most light."""
     if not enlarged:
         return stripe.lines
@@ -258,10 +258,10 @@ def residuals(calibration: Calibration, ax: Axes | None = None, *, which: str | 
         ax.axhline(0, color=INK, linewidth=0.8)
     stem, _, ending = name.rpartition("_")
     unit = _UNITS.get(ending, "") if stem else ""
-    words = (stem if unit else name).replace("_", " ")
+    text = (stem if unit else name).replace("_", " ")
     ax.set(
         xlabel="image" if images or "image" in name else "number",
-        ylabel=plain_text(f"{words} / {unit}" if unit else words),
+        ylabel=plain_text(f"{text} / {unit}" if unit else text),
     )
     if images:
         ax.set_xticks(

@@ -47,9 +47,9 @@ def make_program(name: str, title: str) -> App:
     # The list of commands has no markup, and is shown earlier without Markdown's libraries.
     app = App(name=name, help=title, version=__version__, help_format="plaintext", group_commands=JOBS["Files"])
     app.register_install_completion_command(group=_PROGRAM, help="Install completion of commands for your shell.")
-    for words, text in SWITCHES.values():
+    for names, text in SWITCHES.values():
         # `uwlts.runtime.console.run` takes them out of every command line; alone they do nothing.
-        app.command(lambda: None, name=words, group=_PROGRAM, help=text)
+        app.command(lambda: None, name=names, group=_PROGRAM, help=text)
     for flag in ("--help", "--version"):
         app[flag].group = _PROGRAM
     return app
@@ -136,7 +136,7 @@ class DerivedCommand:
         self._package, self._function, self._also, self._shortcuts = package, function, also, shortcuts
         self._body = body
         self.__name__ = body.__name__
-        prose = summary or _as_help(_sections(docstring(package, function))[0], descriptions(package, function))
+        prose = summary or _convert_help(_sections(docstring(package, function))[0], descriptions(package, function))
         self.__doc__ = f"{prose.rstrip()}\n\n{inspect.getdoc(body)}"
 
     @property
@@ -157,14 +157,16 @@ class DerivedCommand:
     @cached_property
     def _own(self) -> dict[str, inspect.Parameter]:
         """Return the body's parameters after the call; those without an annotation are taken from the functions."""
-        own = dict(list(inspect.signature(self._body, eval_str=True).parameters.items())[1:])
-        like = [name for name, one in own.items() if one.annotation is one.empty and name not in self._taken]
+        parameters = dict(list(inspect.signature(self._body, eval_str=True).parameters.items())[1:])
+        like = [name for name, one in parameters.items() if one.annotation is one.empty and name not in self._taken]
         # Of several functions with the option, the first one counts.
         sources = [_options_of(*function) for function in reversed(self._also)] if like else []
         options = {name: one for source in sources for name, one in source.items()}
         for name in like:
-            own[name] = own[name].replace(annotation=options[name].annotation, default=options[name].default)
-        return own
+            parameters[name] = parameters[name].replace(
+                annotation=options[name].annotation, default=options[name].default
+            )
+        return parameters
 
     @cached_property
     def __signature__(self) -> inspect.Signature:
@@ -192,14 +194,14 @@ class DerivedCommand:
     def __call__(self, *args: Any, **kwargs: Any) -> None:
         """Check the outputs, and run the body."""
         bound = self.__signature__.bind(*args, **kwargs)
-        bound.arguments.update({name: _plain_text(value) for name, value in bound.arguments.items()})
+        bound.arguments.update({name: _convert_text(value) for name, value in bound.arguments.items()})
         explicit = dict(bound.arguments)
         bound.apply_defaults()
         for name, one in self.__signature__.parameters.items():
             checks = [each for each in getattr(one.annotation, "__metadata__", ()) if isinstance(each, Before)]
             for before in checks if bound.arguments[name] is not None else ():
                 before.check(Path(bound.arguments[name]), overwrite=bound.arguments.get("overwrite", False))
-        given = {name: self._plain(name, value) for name, value in explicit.items() if name in self._taken}
+        given = {name: self._convert_value(name, value) for name, value in explicit.items() if name in self._taken}
         if any(one.kind is one.VAR_KEYWORD for one in self._taken.values()):
             given |= {name: value for name, value in explicit.items() if name in self._own}
         if self._shortcuts is not None:
@@ -215,7 +217,7 @@ class DerivedCommand:
         call = Call(self.function, self._taken, given, title)
         self._body(call, **{name: bound.arguments[name] for name in self._own})
 
-    def _plain(self, name: str, value: Any) -> Any:
+    def _convert_value(self, name: str, value: Any) -> Any:
         """Return a value as the function takes it: a single literal word is not a tuple."""
         kinds = union_members(self._taken[name].annotation)
         alone = [word for kind in kinds if get_origin(kind) is Literal for word in get_args(kind)]
@@ -230,7 +232,7 @@ def _options_of(package: ModuleType, function: str) -> dict[str, inspect.Paramet
         kind = None if name in _LISTENERS or one.kind is one.VAR_KEYWORD else option_type(hints[name])
         if kind is None:
             continue
-        text, default = _as_help(described[name], described), one.default
+        text, default = _convert_help(described[name], described), one.default
         parameter = Parameter(help=text, negative="") if kind is bool else Parameter(help=text)
         if get_origin(kind) is tuple and get_args(kind)[-1] is ...:
             if default is not one.empty:
@@ -242,10 +244,10 @@ def _options_of(package: ModuleType, function: str) -> dict[str, inspect.Paramet
     return options
 
 
-def _plain_text(value: Any) -> Any:
+def _convert_text(value: Any) -> Any:
     """Convert `PathText` to `str`, also in a tuple."""
     if isinstance(value, tuple):
-        return tuple(map(_plain_text, value))
+        return tuple(map(_convert_text, value))
     return str(value) if isinstance(value, PathText) else value
 
 
@@ -254,18 +256,18 @@ def option_type(hint: Any) -> Any:
     kinds = list(union_members(hint))
     if Path in kinds:
         kinds = [PathText if kind is str else kind for kind in kinds]
-    words = [kind for kind in _WORDS if kind in kinds] or [kind for kind in kinds if kind is Path]
+    names = [kind for kind in _WORDS if kind in kinds] or [kind for kind in kinds if kind is Path]
     literals = [kind for kind in kinds if get_origin(kind) is Literal]
     for kind in kinds:
         element = option_type(get_args(kind)[0]) if get_origin(kind) in (Sequence, tuple) else None
-        if element is None or (words and element not in words):
+        if element is None or (names and element not in names):
             continue
         if get_origin(kind) is tuple and get_args(kind)[-1] is not ...:
             return _or_none(kind, kinds)
         if literals and get_origin(element) is Literal:
             element = Literal[(*(word for one in literals for word in get_args(one)), *get_args(element))]
         return tuple[element, ...]
-    if plain := words or literals:
+    if plain := names or literals:
         return _or_none(reduce(or_, plain), kinds)
     return tuple[str, ...] if any(get_origin(kind) is Mapping for kind in kinds) else None
 
@@ -307,7 +309,7 @@ def descriptions(package: ModuleType, function: str) -> dict[str, str]:
     return found
 
 
-def _as_help(text: str, names: Collection[str]) -> str:
+def _convert_help(text: str, names: Collection[str]) -> str:
     """Return docstring text as a command's help: options instead of parameters, and no backticks."""
     return replace_by_options(text, names).replace("`", "")
 

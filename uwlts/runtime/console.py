@@ -69,13 +69,13 @@ def progress_bar(title: str) -> Iterator[ProgressListener]:
 
 def _progress_lines(title: str) -> ProgressListener:
     """Return a listener that prints the progress as lines."""
-    begun = said = time.monotonic()
+    begun = shown_s = time.monotonic()
 
     def listen(done: int, total: int, stage: str = "") -> None:
-        nonlocal said
+        nonlocal shown_s
         now = time.monotonic()
-        if now - said >= _LINE_EVERY_S:
-            said = now
+        if now - shown_s >= _LINE_EVERY_S:
+            shown_s = now
             what = make_printable(f"{title} {stage}".rstrip())
             print(f"{what}: {done} of {total} after {now - begun:.0f} s", file=sys.stderr, flush=True)
 
@@ -101,15 +101,15 @@ def run(app: App) -> int:
     # Scripts start background commands with SIGINT ignored, so that it could not stop a laser.
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    words = sys.argv[1:]
-    on = {name: not {*choices}.isdisjoint(words) for name, (choices, _) in SWITCHES.items()}
+    arguments = sys.argv[1:]
+    on = {name: not {*choices}.isdisjoint(arguments) for name, (choices, _) in SWITCHES.items()}
     switches = {word for choices, _ in SWITCHES.values() for word in choices}
-    _quiet, words = on["quiet"], [word for word in words if word not in switches]
+    _quiet, arguments = on["quiet"], [word for word in arguments if word not in switches]
     command: object = None
     try:
         with preserve_interrupts(), warnings.catch_warnings(), ExitStack() as output:
             warnings.showwarning = _show_warning
-            command, bound, _ = app.parse_args(words, exit_on_error=False, print_error=False)
+            command, bound, _ = app.parse_args(arguments, exit_on_error=False, print_error=False)
             if _quiet:
                 output.enter_context(redirect_stdout(output.enter_context(open(os.devnull, "w", encoding="utf-8"))))
             with protect_inputs(bound.arguments):

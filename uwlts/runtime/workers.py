@@ -179,7 +179,7 @@ class _Processes(Workers, AbstractContextManager["_Processes"]):
         self, function: Callable[[Job], Result], jobs: Iterable[Job]
     ) -> Iterator[tuple[Job, Result | Lost]]:
         """See `Workers.map_unordered`."""
-        silent, lost = partial(_without_messages, function), []
+        silent, lost = partial(_silence, function), []
         for _, job, result in self.run(silent, jobs):
             if isinstance(result, Lost):
                 if result.by_error:
@@ -233,7 +233,7 @@ class _Processes(Workers, AbstractContextManager["_Processes"]):
                 yield number, job, result
 
 
-def _without_messages(function: Callable[[Job], Result], job: Job, send: Send) -> Result:
+def _silence(function: Callable[[Job], Result], job: Job, send: Send) -> Result:
     return function(job)
 
 

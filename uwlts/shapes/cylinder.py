@@ -67,9 +67,9 @@ class Cylinder:
         """
         unit, known = prepare_round(points, radius_mm, least=6, what="a cylinder fit")
         thinned = thin_evenly(unit.points, _THINNED)
-        trials = [_refined_cylinder(thinned, *start, known) for start in _cylinder_starts(thinned, known, axis_start)]
+        trials = [_refine_cylinder(thinned, *start, known) for start in _cylinder_starts(thinned, known, axis_start)]
         frame, start, _ = min(trials, key=lambda trial: trial[2])
-        frame, parameters, cost = _refined_cylinder(unit.points, frame, start, known)
+        frame, parameters, cost = _refine_cylinder(unit.points, frame, start, known)
         covariance, std = parameter_covariance(
             _cylinder_jacobian(parameters, unit.points, frame), cost, what="a cylinder"
         )
@@ -96,9 +96,9 @@ def _cylinder_geometry(
     direction = frame[2] + parameters[2:4] @ frame[:2]
     stretch = float(np.linalg.norm(direction))
     direction = direction / stretch
-    away = points - parameters[:2] @ frame[:2]
-    along = away @ direction
-    return away - along[:, None] * direction, along, stretch
+    offset = points - parameters[:2] @ frame[:2]
+    along = offset @ direction
+    return offset - along[:, None] * direction, along, stretch
 
 
 def _cylinder_jacobian(parameters: np.ndarray, points: np.ndarray, frame: np.ndarray) -> np.ndarray:
@@ -109,7 +109,7 @@ def _cylinder_jacobian(parameters: np.ndarray, points: np.ndarray, frame: np.nda
     return np.hstack([across, across * (along / stretch)[:, None], by_radius])
 
 
-def _refined_cylinder(
+def _refine_cylinder(
     points: np.ndarray, frame: np.ndarray, start: np.ndarray, known: float | None
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return frame, parameters and cost of the solution, with the frame rotated so that both slopes are zero."""

@@ -161,9 +161,9 @@ class Circle:
         offset, radius = fit_algebraic_centres(points - middle)
         result = np.append(middle + offset, radius)
         for _ in range(_CIRCLE_STEPS):
-            away = points - result[:2]
-            distance = np.maximum(np.linalg.norm(away, axis=1), 1e-12 * extent)
-            design = np.column_stack([away / distance[:, None], np.ones(len(away))])
+            from_centre = points - result[:2]
+            distance = np.maximum(np.linalg.norm(from_centre, axis=1), 1e-12 * extent)
+            design = np.column_stack([from_centre / distance[:, None], np.ones(len(from_centre))])
             step = np.linalg.lstsq(design, distance - result[2], rcond=None)[0]
             result = result + step
             if np.abs(step).max() <= 1e-9 * extent and 0 < result[2] < _LARGEST_CIRCLE * extent:

@@ -52,12 +52,12 @@ class Detection:
         rows = np.flatnonzero(self.members)
         spacing = float(np.median(np.linalg.norm(np.diff(points[rows], axis=0), axis=1)))
         beside, there = np.zeros(count), np.zeros(count)
-        for apart in range(1, min(_NEIGHBOURS, count - 1) + 1):
-            near = np.linalg.norm(points[apart:] - points[:-apart], axis=1) < _LARGEST_GAP * spacing * apart
-            beside[:-apart] += near & self.members[apart:]
-            beside[apart:] += near & self.members[:-apart]
-            there[:-apart] += 1
-            there[apart:] += 1
+        for lag in range(1, min(_NEIGHBOURS, count - 1) + 1):
+            near = np.linalg.norm(points[lag:] - points[:-lag], axis=1) < _LARGEST_GAP * spacing * lag
+            beside[:-lag] += near & self.members[lag:]
+            beside[lag:] += near & self.members[:-lag]
+            there[:-lag] += 1
+            there[lag:] += 1
         return replace(self, members=self.members & (beside >= _LEAST_BESIDE * there))
 
 
@@ -132,8 +132,8 @@ def _fits_radius(arc: ProfileArc, points: np.ndarray, radius_mm: float, toleranc
     half = float(np.linalg.norm(np.ptp(points[arc.members], axis=0))) / 2
     if arc.radius_mm <= radius_mm or half >= radius_mm:
         return arc.radius_mm < radius_mm + 2 * tolerance
-    own, largest = (radius - np.sqrt(radius**2 - half**2) for radius in (arc.radius_mm, radius_mm))
-    return largest - own < 2 * tolerance
+    height, largest = (radius - np.sqrt(radius**2 - half**2) for radius in (arc.radius_mm, radius_mm))
+    return largest - height < 2 * tolerance
 
 
 def _circles_through(triples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -142,8 +142,8 @@ def _circles_through(triples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     with np.errstate(divide="ignore", invalid="ignore"):
         double = 2 * (b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0])
         bb, cc = np.sum(b**2, axis=1), np.sum(c**2, axis=1)
-        away = np.stack([c[:, 1] * bb - b[:, 1] * cc, b[:, 0] * cc - c[:, 0] * bb], axis=1) / double[:, None]
-    return triples[:, 0] + away, np.linalg.norm(away, axis=1)
+        offset = np.stack([c[:, 1] * bb - b[:, 1] * cc, b[:, 0] * cc - c[:, 0] * bb], axis=1) / double[:, None]
+    return triples[:, 0] + offset, np.linalg.norm(offset, axis=1)
 
 
 def _refit_inliers(
@@ -157,9 +157,9 @@ def _refit_inliers(
     for _ in range(_LARGEST_ROUNDS):
         if np.count_nonzero(members) < LEAST_POINTS:
             return None
-        away = np.abs(off(members))
-        std = robust_std(away[members])
-        before, members = members, away < min(max(_REJECTED_BEYOND * std, _LEAST_TOLERANCE_MM), 2 * tolerance)
+        deviation = np.abs(off(members))
+        std = robust_std(deviation[members])
+        before, members = members, deviation < min(max(_REJECTED_BEYOND * std, _LEAST_TOLERANCE_MM), 2 * tolerance)
         if np.array_equal(before, members):
             break
     return (members, std) if np.count_nonzero(members) >= LEAST_POINTS else None
@@ -178,15 +178,15 @@ def _refine_arc(points: np.ndarray, members: np.ndarray, tolerance: float) -> Pr
         return None
     # Scattered points fill the band of 2 tolerances evenly: their robust standard deviation is 1.5 tolerances, that of
     # an arc at most 0.9. They are as dense beside the circle, in a band twice as wide.
-    away = np.abs(circle.distances_mm(points))
-    chance = np.count_nonzero((away > 2 * tolerance) & (away < 4 * tolerance)) / 2
+    deviation = np.abs(circle.distances_mm(points))
+    chance = np.count_nonzero((deviation > 2 * tolerance) & (deviation < 4 * tolerance)) / 2
     if std > tolerance or np.count_nonzero(members) < LEAST_POINTS + chance + _REJECTED_BEYOND * np.sqrt(chance):
         return None
     return ProfileArc(members=members, std_mm=std, centre_mm=circle.centre_mm, radius_mm=circle.radius_mm)
 
 
-def _arc_angle(away: np.ndarray) -> float:
-    angles = np.sort(np.arctan2(away[:, 1], away[:, 0]))
+def _arc_angle(offsets: np.ndarray) -> float:
+    angles = np.sort(np.arctan2(offsets[:, 1], offsets[:, 0]))
     gaps = np.diff(angles, append=angles[0] + 2 * np.pi)
     return float(2 * np.pi - gaps.max())
 

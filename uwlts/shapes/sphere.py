@@ -176,12 +176,12 @@ def _propose_centres(points: np.ndarray, radius: float, rng: np.random.Generator
 def _refine_centre(points: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
     """Refine a centre by Gauss-Newton steps with known radius on the points within the search limit."""
     for _ in range(4):
-        away = points - centre
-        distance = np.linalg.norm(away, axis=1)
+        offset = points - centre
+        distance = np.linalg.norm(offset, axis=1)
         near = np.abs(distance - radius) < _SEARCH_LIMIT * radius
         if np.count_nonzero(near) < 4:
             return centre
-        unit = away[near] / distance[near, None]
+        unit = offset[near] / distance[near, None]
         step, *_ = np.linalg.lstsq(unit, distance[near] - radius, rcond=1e-3)
         centre = centre + step
     return centre
@@ -216,17 +216,17 @@ def _accept(points: np.ndarray, usable: np.ndarray, centre: np.ndarray, radius: 
     return FoundSphere(fit_robustly(Sphere.fit, points[members]), members, near, points_mixed)
 
 
-def _mark_crossed(away: np.ndarray, distances: np.ndarray, limit: float, usable: np.ndarray) -> np.ndarray:
+def _mark_crossed(offsets: np.ndarray, distances: np.ndarray, limit: float, usable: np.ndarray) -> np.ndarray:
     """Return a mask (N,) of points in patches where many points are between one and three limits from the sphere.
 
     For the sphere alone this band is nearly empty. A crossing surface has twice as many points in it as within one
     limit.
     """
     near = np.flatnonzero(usable & (np.abs(distances) <= 3 * limit))
-    crossed = np.zeros(len(away), dtype=bool)
+    crossed = np.zeros(len(offsets), dtype=bool)
     if not len(near):
         return crossed
-    direction = away[near] / np.linalg.norm(away[near], axis=1, keepdims=True)
+    direction = offsets[near] / np.linalg.norm(offsets[near], axis=1, keepdims=True)
     _, cell = np.unique(number_cubes(direction + 1.0, _CELL), return_inverse=True)
     outer = np.bincount(cell, weights=np.abs(distances[near]) > limit)
     total = np.bincount(cell)

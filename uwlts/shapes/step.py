@@ -60,7 +60,7 @@ def label_step_faces(points: np.ndarray, *, height_mm: float, edge_mm: float = 1
     """
     points = check_points(points, least=20, what="a step", dimensions=(2, 3))
     least = 10 if points.shape[1] == 2 else 40
-    proposal = _best_proposal(thin_evenly(points, _THINNED), height_mm, np.random.default_rng(0))
+    proposal = _choose_proposal(thin_evenly(points, _THINNED), height_mm, np.random.default_rng(0))
     if proposal is None:
         raise EvaluationError(
             f"no two parallel step faces at a distance of about {height_mm:g} mm among {len(points)} points; "
@@ -130,7 +130,7 @@ def _require_faces(*, heights: np.ndarray, labels: np.ndarray, height: float, le
         )
 
 
-def _best_proposal(
+def _choose_proposal(
     points: np.ndarray, height: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, float, float] | None:
     """Return the normal towards the sensor, the level of one face and the signed offset of the best supported pair."""

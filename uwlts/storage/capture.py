@@ -159,7 +159,7 @@ def require_covariances(values: np.ndarray, path: Path) -> None:
         raise CaptureError(f"{path}: the covariance of a pose is symmetric without negative variances")
 
 
-def _what_is_wrong(error: Exception) -> str:
+def _explain_damage(error: Exception) -> str:
     """Return HDF5's message about a file that it cannot open; the two most frequent ones in plain English."""
     if found := re.search(r"truncated file: eof = (\d+).*stored_eof = (\d+)", str(error)):
         return f"it has {int(found[1]):,} of its {int(found[2]):,} bytes; copy it again"
@@ -209,7 +209,7 @@ class Capture(AbstractContextManager["Capture"]):
             unfinished = not self.finished or has_writer(self.path)
             self.file = open_unfinished(self.path) if unfinished else h5py.File(self.path, "r")
         except DAMAGE as error:
-            raise CaptureError(f"{self.path} is not a capture, or is truncated: {_what_is_wrong(error)}") from error
+            raise CaptureError(f"{self.path} is not a capture, or is truncated: {_explain_damage(error)}") from error
         try:
             self.header = read_label(self.file, CaptureHeader, path=self.path, file_format=FORMAT, version=VERSION)
             self._read_frames(unfinished=unfinished)
@@ -398,8 +398,12 @@ def describe_source(capture: Capture) -> CaptureSource:
         known |= {"offset_px": list(offset)}
     if medium.kind in ("fresh", "sea"):
         known |= {"temperature_c": medium.temperature_c, "salinity_g_kg": medium.salinity_g_kg}
-    own = {"target": header.target, "artefact": header.artefact, "black_level": header.provenance.get("black_level")}
-    known |= {key: thing for key, thing in own.items() if thing is not None}
+    described = {
+        "target": header.target,
+        "artefact": header.artefact,
+        "black_level": header.provenance.get("black_level"),
+    }
+    known |= {key: thing for key, thing in described.items() if thing is not None}
     identity: Table = {"file": capture.path.name, "name": header.name, "sha256": hash_file(capture.path)}
     counts: Table = {"lamp_images": len(capture) - laser, "laser_images": laser}
     return CaptureSource.model_validate(identity | counts | known)

@@ -357,9 +357,9 @@ def _directions(cloud: PointCloud, known: PointUncertainty, along: str) -> np.nd
     order = np.argsort(keys, kind="stable")
     ordered, unit = keys[order], count if along == "frame" else 1
 
-    def to_neighbours(step: int, away: int) -> np.ndarray:
-        """Return vectors (K, 3) from every ``step``-th point to that whose key differs by ``away``, else infinite."""
-        wanted = keys[::step] + away
+    def to_neighbours(step: int, lag: int) -> np.ndarray:
+        """Return vectors (K, 3) from every ``step``-th point to that whose key differs by ``lag``, else infinite."""
+        wanted = keys[::step] + lag
         place = np.minimum(np.searchsorted(ordered, wanted), len(ordered) - 1)
         found = (ordered[place] == wanted)[:, None]
         return np.where(found, cloud.points_mm[order[place]] - cloud.points_mm[::step], np.inf)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from uwlts.errors import CaptureError, OutputError
 from uwlts.files.reading import log_warnings, open_regular, parse_json, require_regular_file
-from uwlts.files.writing import refuse_unsuitable, require_ending, write_atomically
+from uwlts.files.writing import refuse_unsuitable, require_ending, write_atomically, write_file
 from uwlts.model.sensor import Description, Table
 from uwlts.storage.cloud import (
     FARTHEST_SINGLE_MM,
@@ -99,7 +99,7 @@ def write_cloud(
         arrays, known = {name: getattr(cloud, name) for name in KINDS}, cloud.uncertainty
         if known is not None:
             arrays |= {name: getattr(known, name) for name in _UNCERTAINTY} | {"systematic_mm2": known.systematic_mm2()}
-        header = _CloudHeader(metadata=_with_shared(cloud))
+        header = _CloudHeader(metadata=_add_shared(cloud))
         write_arrays(path, arrays, file_format=FORMAT, version=VERSION, header=header, overwrite=overwrite)
         return
     single = str(path).lower().endswith(SINGLE)
@@ -120,7 +120,7 @@ def write_cloud(
     if full:
         columns |= _uncertainty_columns(cloud.uncertainty)
     cloud = cloud if full else replace(cloud, uncertainty=None)
-    write_ply_points(path, columns, comments=_comments(_with_shared(cloud)), overwrite=overwrite)
+    write_ply_points(path, columns, comments=_comments(_add_shared(cloud)), overwrite=overwrite)
 
 
 PointCloud.writer = staticmethod(write_cloud)
@@ -130,8 +130,7 @@ def write_ply_points(
     path: Path, columns: Mapping[str, np.ndarray], *, comments: Sequence[str] = (), overwrite: bool
 ) -> None:
     """Write columns (N,) as properties of vertices, binary and little-endian, completely or not at all."""
-    with write_atomically(path, overwrite=overwrite) as aside:
-        aside.write_bytes(encode_ply(columns, comments=comments))
+    write_file(path, encode_ply(columns, comments=comments), overwrite=overwrite)
 
 
 def refuse_unsuitable_cloud(path: str | os.PathLike[str], *, overwrite: bool, coloured: bool = False) -> None:
@@ -182,15 +181,15 @@ def read_thinned_cloud(
 
     For HDF5 and binary PLY only these are held in memory.
     """
-    with _naming(path):
+    with _name_errors(path):
         if (form := find_format(path)) is not None:
             whole = form.read(Path(path), unit)
-            cloud, total = whole.select(_every(len(whole), at_most)), len(whole)
+            cloud, total = whole.select(_choose_rows(len(whole), at_most)), len(whole)
         else:
-            cloud, total = _read_rows(Path(path), lambda count: _every(count, at_most))
+            cloud, total = _read_rows(Path(path), lambda count: _choose_rows(count, at_most))
         if not len(cloud) and cloud.warnings:
             raise CaptureError(f"no point is left: {'; '.join(cloud.warnings)}")
-        return _in_mm(cloud, path, unit), total
+        return _convert_to_mm(cloud, path, unit), total
 
 
 def read_region(
@@ -213,7 +212,7 @@ def read_region(
         for part in read_parts(path, unit=unit)
     ]
     whole = concatenate_clouds(found)
-    return whole.select(_every(len(whole), at_most))
+    return whole.select(_choose_rows(len(whole), at_most))
 
 
 def read_parts(
@@ -229,9 +228,9 @@ def read_parts(
         return
     start, total = 0, 1
     while start < total:
-        with _naming(path):
+        with _name_errors(path):
             part, total = _read_rows(Path(path), lambda _, start=start: slice(start, start + most))
-            part = _in_mm(part, path, unit)
+            part = _convert_to_mm(part, path, unit)
         yield part
         start += most
 
@@ -242,7 +241,7 @@ def unit_of(path: str | os.PathLike[str]) -> Unit:
     return "mm" if form is None or form.unit is None else form.unit
 
 
-def _in_mm(cloud: PointCloud, path: str | os.PathLike[str], unit: Unit | None) -> PointCloud:
+def _convert_to_mm(cloud: PointCloud, path: str | os.PathLike[str], unit: Unit | None) -> PointCloud:
     """Convert a cloud from ``unit`` to mm, note the step of its numbers, and log its warnings.
 
     Raises CaptureError if its file states another unit.
@@ -250,14 +249,14 @@ def _in_mm(cloud: PointCloud, path: str | os.PathLike[str], unit: Unit | None) -
     form = find_format(path)
     # Foreign formats without a prescribed unit were converted when they were read.
     if form is None or form.unit is not None:
-        own = _in_hdf5(path) or bool(cloud.metadata.keys() - {STEP}) or cloud.uncertainty is not None
-        stated = unit_of(path) if own or form is not None else None
+        of_program = _in_hdf5(path) or bool(cloud.metadata.keys() - {STEP}) or cloud.uncertainty is not None
+        stated = unit_of(path) if of_program or form is not None else None
         if unit is not None and stated not in (None, unit):
             raise CaptureError(
                 f"{path} is in {stated}, as its format prescribes, but the unit {unit} was given: omit it"
             )
         if Path(path).suffix.lower() == ".ply":
-            named, doubts = ("mm", []) if own else find_stated_unit(read_comments(Path(path)))
+            named, doubts = ("mm", []) if of_program else find_stated_unit(read_comments(Path(path)))
             scale, step = choose_scale(named, unit, Path(path), CaptureError), find_float_step(cloud.points_mm)
             known = replace(cloud, points_mm=scale * cloud.points_mm, warnings=[*doubts, *cloud.warnings])
             cloud = note_step(known, scale * step)
@@ -266,7 +265,7 @@ def _in_mm(cloud: PointCloud, path: str | os.PathLike[str], unit: Unit | None) -
 
 
 @contextmanager
-def _naming(path: str | os.PathLike[str]) -> Iterator[None]:
+def _name_errors(path: str | os.PathLike[str]) -> Iterator[None]:
     """Add the file's name to CaptureErrors without it."""
     try:
         yield
@@ -283,7 +282,7 @@ def _read_rows(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     return _read_hdf5(path, rows) if _in_hdf5(path) else _read_ply(path, rows)
 
 
-def _every(count: int, at_most: int | None) -> slice:
+def _choose_rows(count: int, at_most: int | None) -> slice:
     """Return a slice with an even sample of at most ``at_most`` of ``count`` points."""
     return slice(None, None, 1 if at_most is None else max(1, -(-count // at_most)))
 
@@ -333,7 +332,7 @@ def _uncertainty_columns(uncertainty: PointUncertainty | None) -> dict[str, np.n
     return {name: values.astype(np.float32) for name, values in columns.items()}
 
 
-def _with_shared(cloud: PointCloud) -> Table:
+def _add_shared(cloud: PointCloud) -> Table:
     """Return the metadata to store, with the errors shared with other clouds."""
     if cloud.uncertainty is None or not cloud.uncertainty.shared:
         return cloud.metadata
@@ -341,7 +340,7 @@ def _with_shared(cloud: PointCloud) -> Table:
     return {**cloud.metadata, _SHARED: shared}
 
 
-def _without_shared(metadata: Table, known: PointUncertainty | None) -> tuple[Table, PointUncertainty | None]:
+def _split_shared(metadata: Table, known: PointUncertainty | None) -> tuple[Table, PointUncertainty | None]:
     """Separate metadata from shared errors; raises CaptureError if the errors do not match the uncertainty."""
     if _SHARED not in metadata:
         return metadata, known
@@ -366,11 +365,11 @@ def _comments(metadata: Table) -> list[str]:
 
 
 def _metadata(comments: list[str]) -> Table:
-    own = [comment for comment in comments if comment.startswith(_COMMENT)]
-    if not own:
+    stored = [comment for comment in comments if comment.startswith(_COMMENT)]
+    if not stored:
         return {}
-    pieces = [_PIECE.fullmatch(comment) for comment in own]
-    wanted = [(str(number), str(len(own))) for number in range(1, len(own) + 1)]
+    pieces = [_PIECE.fullmatch(comment) for comment in stored]
+    wanted = [(str(number), str(len(stored))) for number in range(1, len(stored) + 1)]
     if [piece and piece.groups()[:2] for piece in pieces] != wanted:
         raise CaptureError("its metadata is incomplete; write the file again or remove those comments")
     try:
@@ -437,7 +436,7 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
         return column(name, np.nan) if name in known and uncertainty is None else None
 
     deviation = column("deviation", np.nan)
-    metadata, uncertainty = _without_shared(_metadata(comments), uncertainty)
+    metadata, uncertainty = _split_shared(_metadata(comments), uncertainty)
     cloud = PointCloud(
         points_mm=points,
         intensity=column("intensity", np.nan),
@@ -485,5 +484,5 @@ def _read_hdf5(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     wanted = [*PER_POINT, *(_UNCERTAINTY[:-1] if parts else ())]
     if missing := [name for name in wanted if name not in arrays | parts]:
         raise CaptureError(f"{path} is damaged: it has no {', '.join(missing)}")
-    metadata, known = _without_shared(header.metadata, PointUncertainty(**parts) if parts else None)
+    metadata, known = _split_shared(header.metadata, PointUncertainty(**parts) if parts else None)
     return PointCloud(**arrays, uncertainty=known, metadata=metadata), total

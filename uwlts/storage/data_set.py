@@ -97,7 +97,7 @@ class ShardReader:
         require_regular_file(self.path, called="shard of a data set")
         try:
             if self._places is None:
-                self._places = self._found_places()
+                self._places = self._find_places()
             key, places = self._places[number]
             sample: dict[str, Any] = {"key": key}
             with open(self.path, "rb") as file:
@@ -110,7 +110,7 @@ class ShardReader:
             raise CaptureError(f"{self.path} is not a shard of this data set, or is damaged: {error}") from error
         return sample
 
-    def _found_places(self) -> list[tuple[str, dict[str, tuple[int, int]]]]:
+    def _find_places(self) -> list[tuple[str, dict[str, tuple[int, int]]]]:
         """Return the key of each sample, with offset and size of its files by their endings."""
         found: dict[str, dict[str, tuple[int, int]]] = {}
         with tarfile.open(self.path, "r:") as archive:
@@ -209,8 +209,8 @@ class DataSet(Sequence[dict[str, Any]]):
     def __iter__(self) -> Iterator[dict[str, Any]]:
         for reader in self._readers:
             # A temporary reader, so that its table of contents does not stay in memory.
-            own = ShardReader(reader.path, frames=reader.frames)
-            yield from (own.sample(number, self._names) for number in range(own.frames))
+            shard = ShardReader(reader.path, frames=reader.frames)
+            yield from (shard.sample(number, self._names) for number in range(shard.frames))
 
 
 def load_dataset(folder: str | Path, *, split: Split | None = None, names: Sequence[str] | None = None) -> DataSet:

@@ -22,7 +22,7 @@ from pydantic import JsonValue
 
 from uwlts.errors import CaptureError, Error
 from uwlts.files.reading import MOST_JSON_BYTES, is_regular_file, parse_json
-from uwlts.files.writing import write_atomically
+from uwlts.files.writing import write_file
 from uwlts.model.library import validate_description
 from uwlts.model.sensor import Description, Table
 
@@ -66,8 +66,7 @@ def write_arrays(
                 file.create_dataset(
                     name, data=data, compression="gzip", compression_opts=1, shuffle=True, fletcher32=True
                 )
-    with write_atomically(path, overwrite=overwrite) as aside:
-        aside.write_bytes(content.getbuffer())
+    write_file(path, content.getbuffer(), overwrite=overwrite)
 
 
 def read_label(

@@ -104,19 +104,19 @@ _AROUND = re.compile(r"^libpng error: |^\[ERROR:\S+ global \S+ (TIFF_Error |.*er
 @contextmanager
 def _capture_damage() -> Iterator[list[str]]:
     """Collect the lines about damage that are written to standard error within the context; complete at its end."""
-    said: list[str] = []
+    messages: list[str] = []
     usual = os.dup(_STANDARD_ERROR)
     with tempfile.TemporaryFile() as listener:
         os.dup2(listener.fileno(), _STANDARD_ERROR)
         try:
-            yield said
+            yield messages
         finally:
             os.dup2(usual, _STANDARD_ERROR)
             os.close(usual)
             listener.seek(0)
             for line in listener:
                 if _DAMAGE.search(line):
-                    said.append(line.decode(errors="replace"))
+                    messages.append(line.decode(errors="replace"))
                 elif line.strip() and not line.startswith(_WARNING):
                     os.write(_STANDARD_ERROR, line)
 
@@ -131,11 +131,11 @@ def read_image(path: Path, *, accept: Callable[[ImageHeader], None] = lambda dec
     declared = read_header(content, path)
     accept(declared)
     try:
-        with _capture_damage() as said:
+        with _capture_damage() as messages:
             image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise ImageError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
-    damage = " ".join(_AROUND.sub("", said[0].strip()).split()) if said else ""
+    damage = " ".join(_AROUND.sub("", messages[0].strip()).split()) if messages else ""
     if image is None or damage:
         found = f"{len(content)} bytes" + (f", its decoder says: {damage}" if damage else "")
         raise ImageError(f"{path} is a {declared.kind} file that is truncated or damaged ({found}); copy it again")

@@ -14,7 +14,7 @@ import numpy as np
 from uwlts.argument_types import check_arguments
 from uwlts.errors import CaptureError, OutputError
 from uwlts.files.reading import log_warnings, open_regular, require_regular_file
-from uwlts.files.writing import write_atomically
+from uwlts.files.writing import write_file
 from uwlts.model.sensor import Table
 from uwlts.model.short_text import Brief
 from uwlts.storage.cloud import FARTHEST_SINGLE_MM
@@ -112,8 +112,7 @@ class SurfaceMesh(Brief):
         if (encode := {".ply": _ply, ".stl": _stl, ".glb": _glb}.get(path.suffix.lower())) is None:
             raise OutputError(f"{path} ends with none of {', '.join(MESH_FORMATS)}, which name the format of a mesh")
         content = encode(self)
-        with write_atomically(path, overwrite=overwrite) as aside:
-            aside.write_bytes(content)
+        write_file(path, content, overwrite=overwrite)
 
 
 def has_faces(path: Path) -> bool:
@@ -152,14 +151,14 @@ def load_triangles(path: Path, *, unit: Unit | None = None) -> trimesh.Trimesh:
             f"{path} has {len(vertices)} vertices, and triangles of the vertices {faces.min()} to {faces.max()}: the "
             "file is damaged or incomplete"
         )
-    stated, doubts = _stated_unit(path, loaded.units)
+    stated, doubts = _find_unit(path, loaded.units)
     log_warnings(path, doubts)
     if (scale := choose_scale(stated, unit, path, CaptureError)) != 1 or ending in _Y_UP:
         loaded.vertices = scale * vertices @ (_TO_Z_UP if ending in _Y_UP else np.eye(3)).T
     return loaded
 
 
-def _stated_unit(path: Path, known: str | None) -> tuple[str, list[str]]:
+def _find_unit(path: Path, known: str | None) -> tuple[str, list[str]]:
     """Return the unit that a mesh's format or comments state, empty without, and doubts; ``known`` is trimesh's."""
     match path.suffix.lower():
         case ".glb" | ".gltf":

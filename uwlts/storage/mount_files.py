@@ -56,7 +56,7 @@ class MountOptions(Description):
     time: bool = False
 
     @model_validator(mode="after")
-    def _fitting_artefact(self) -> "MountOptions":
+    def _check_artefact(self) -> "MountOptions":
         if self.radius_mm is not None and self.artefact != "sphere":
             raise ValueError(f"a {self.artefact} has no radius: leave radius_mm out")
         return self
@@ -99,7 +99,7 @@ def read_mount_evidence(
     if isinstance(poses, str | Path):
         poses, times = read_poses(poses, pose_format=chosen.pose_format, unit=chosen.pose_unit)
         pose_times_s = times if pose_times_s is None else pose_times_s
-    checked = [_checked_profile(profile, number) for number, profile in enumerate(profiles)]
+    checked = [_check_profile(profile, number) for number, profile in enumerate(profiles)]
     matrices = check_matrices(np.asarray(poses, dtype=np.float64), "poses")
     if chosen.axis is not None:
         if chosen.artefact != "sphere" or chosen.scale:
@@ -110,7 +110,7 @@ def read_mount_evidence(
     if chosen.time and (profile_times_s is None or pose_times_s is None):
         raise DescriptionError("a time offset needs the times of profiles and poses: give both a column time_s")
     if profile_times_s is not None and pose_times_s is not None and (chosen.time or len(matrices) != len(checked)):
-        profile_times_s, pose_times_s = _checked_times(profile_times_s, pose_times_s, len(checked), len(matrices))
+        profile_times_s, pose_times_s = _check_times(profile_times_s, pose_times_s, len(checked), len(matrices))
     else:
         profile_times_s = pose_times_s = None
         if len(matrices) != len(checked):
@@ -127,7 +127,7 @@ def read_mount_evidence(
         names=names or [str(number + 1) for number in range(len(checked))],
         profile_times_s=profile_times_s,
         pose_times_s=pose_times_s,
-        digests={file.name: hash_file(file) for each in given for file in _listed_files(each)},
+        digests={file.name: hash_file(file) for each in given for file in _list_files(each)},
     )
 
 
@@ -156,7 +156,7 @@ def require_table(poses: np.ndarray) -> None:
         )
 
 
-def _checked_profile(profile: np.ndarray, number: int) -> np.ndarray:
+def _check_profile(profile: np.ndarray, number: int) -> np.ndarray:
     points = np.asarray(profile, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] not in (2, 3):
         raise DescriptionError(
@@ -168,7 +168,7 @@ def _checked_profile(profile: np.ndarray, number: int) -> np.ndarray:
     return points
 
 
-def _checked_times(
+def _check_times(
     profile_times_s: np.ndarray, pose_times_s: np.ndarray, profiles: int, poses: int
 ) -> tuple[np.ndarray, np.ndarray]:
     wanted, times = np.asarray(profile_times_s, dtype=np.float64), np.asarray(pose_times_s, dtype=np.float64)
@@ -184,7 +184,7 @@ def _checked_times(
     return wanted, times
 
 
-def _listed_files(path: Path) -> list[Path]:
+def _list_files(path: Path) -> list[Path]:
     """Return the CSV files of a folder, in the order of the numbers in their names, or a file alone."""
     if not path.is_dir():
         return [path]
@@ -203,7 +203,7 @@ def read_profiles(
     """
     path = Path(path)
     if path.is_dir():
-        if not (files := _listed_files(path)):
+        if not (files := _list_files(path)):
             raise DescriptionError(f"{path} holds no CSV files: expected one for each pose")
         listed = [file.name for file in files]
         log_warnings(path, name_gaps(listed, count_names(listed)))

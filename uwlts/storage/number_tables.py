@@ -125,9 +125,9 @@ def find_stated_unit(texts: Iterable[str]) -> tuple[str, list[str]]:
     lengths = {_plain_unit(match[1]) for match in matches if match} & _LENGTHS.keys()
     if len(lengths) == 1:
         return lengths.pop(), []
-    said = [text for text in texts if _UNIT_IN_COMMENT.search(text.lower())]
+    stated = [text for text in texts if _UNIT_IN_COMMENT.search(text.lower())]
     doubt = "a comment may state another unit than that of the coordinates"
-    return "", [f"{doubt}: {shorten(said[0], 100)}"] if said else []
+    return "", [f"{doubt}: {shorten(stated[0], 100)}"] if stated else []
 
 
 def _split_lines(
@@ -143,7 +143,7 @@ def _split_lines(
     counted = None
     if len(lines) > 1 and lines[0].isdigit() and len(lines[0]) < 12 and len(_split(lines[1])) > 1:
         counted = int(lines.pop(0))
-    lines, block = _without_block(lines)
+    lines, block = _drop_block(lines)
     header = None
     first = [cell.strip().strip(b'"') for cell in _split(lines[0])]
     if any(first) and not any(map(_is_number, first)):
@@ -271,11 +271,11 @@ def _name_axes(names: list[str], path: Path) -> tuple[list[str], tuple[str, ...]
 
 def _is_unit_row(line: bytes) -> bool:
     """Return whether the cells of a line are units or empty."""
-    cells = [_bare_unit(cell) for cell in re.split(r"[,;\t]" if re.search(rb"[,;\t]", line) else r"\s+", _text(line))]
+    cells = [_strip_unit(cell) for cell in re.split(r"[,;\t]" if re.search(rb"[,;\t]", line) else r"\s+", _text(line))]
     return any(cells) and all(not cell or cell in _UNITS for cell in cells)
 
 
-def _bare_unit(cell: str) -> str:
+def _strip_unit(cell: str) -> str:
     """Return a unit without quotes and brackets; empty for a dash or one, which mean none."""
     unit = _plain_unit(cell.strip(" \"'[]()<>").lower())
     return "" if unit in ("-", "1") else unit
@@ -286,7 +286,7 @@ def _add_units(names: list[str], units: list[str], path: Path) -> list[str]:
     if len(units) != len(names):
         raise DescriptionError(f"{path} has {len(names)} names of columns and {len(units)} units in the row below")
     found = []
-    for name, unit in zip(names, map(_bare_unit, units), strict=True):
+    for name, unit in zip(names, map(_strip_unit, units), strict=True):
         stated = _split_unit(name)[1]
         if unit and stated not in (None, unit):
             raise DescriptionError(f"{path} has a column {shorten(repr(name))} and the unit {unit} in the row below")
@@ -319,7 +319,7 @@ def _seems_decimal(lines: list[bytes]) -> bool:
     return plain and _FEWEST <= len(decimals) == len(lines) and len(lengths) > 2 and max(map(len, lengths)) == 1
 
 
-def _without_block(lines: list[bytes]) -> tuple[list[bytes], list[bytes]]:
+def _drop_block(lines: list[bytes]) -> tuple[list[bytes], list[bytes]]:
     """Remove lines that sensors write before the names of columns, and return them, too.
 
     The names contain x and z, or an angle, and a row of as many numbers follows, perhaps after a row of units.
@@ -339,8 +339,8 @@ def _separators(line: bytes) -> tuple[bytes, bool]:
     for mark in (b";", b"\t"):
         if mark in line.strip():
             return mark, False
-    words = line.split()
-    if len(words) > 1 and b"," in line and all(map(_DECIMAL_COMMA.fullmatch, words)):
+    parts = line.split()
+    if len(parts) > 1 and b"," in line and all(map(_DECIMAL_COMMA.fullmatch, parts)):
         return b" ", True
     return (b"," if b"," in line else b" "), False
 
@@ -398,9 +398,9 @@ def _split_unit(cell: str) -> tuple[str, str | None]:
         text, unit = match[1], _plain_unit(match[2]) or None
     elif match := _AT_END.fullmatch(text):
         stem, last = match[1] or match[3], _plain_unit(match[2] or match[4])
-        if last in _UNITS and _usual_name(stem) in _UNITS_OF:
+        if last in _UNITS and _normalise_name(stem) in _UNITS_OF:
             text, unit = stem, last
-    return _usual_name(text.strip()), unit
+    return _normalise_name(text.strip()), unit
 
 
 def _plain_unit(unit: str) -> str:
@@ -408,7 +408,7 @@ def _plain_unit(unit: str) -> str:
     return _SAME_UNITS.get(unit, unit)
 
 
-def _usual_name(name: str) -> str:
+def _normalise_name(name: str) -> str:
     if name in _TIME_NAMES:
         return "time_s"
     if name in _SAME_NAMES:

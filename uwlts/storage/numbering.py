@@ -48,8 +48,8 @@ def count_names(names: Sequence[str]) -> Counted | None:
     if len(forms) > 1:
         usual = forms.most_common(1)[0][0]
         one, other = (
-            next(n for n, part in zip(names, parts, strict=True) if (tuple(part[::2]) == usual) is alike)
-            for alike in (True, False)
+            next(n for n, part in zip(names, parts, strict=True) if (tuple(part[::2]) == usual) is same_length)
+            for same_length in (True, False)
         )
         raise DescriptionError(
             f"{one} and {other} are named in different ways, so that their order is unknown: narrow the patterns, or "

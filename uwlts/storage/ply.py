@@ -166,14 +166,14 @@ def _parse_lines(lines: Sequence[bytes], properties: Sequence[_Property], count:
     table = np.empty(count if properties else 0, _table_type(properties, "="))
     columns: list[list[Any]] = [[] for _ in properties]
     for number, line in enumerate(lines if properties else ()):
-        words, place = line.split(), 0
+        parts, place = line.split(), 0
         for one, column in zip(properties, columns, strict=True):
-            word = words[place] if place < len(words) else b""
-            length = int(word) if word.isdigit() and len(word) < 10 else len(words)
-            column.append(word if one.length is None else words[place + 1 : place + 1 + length])
+            word = parts[place] if place < len(parts) else b""
+            length = int(word) if word.isdigit() and len(word) < 10 else len(parts)
+            column.append(word if one.length is None else parts[place + 1 : place + 1 + length])
             place += 1 if one.length is None else 1 + length
-        if place != len(words):
-            raise _fault(path, f"line {number + 1} of an element has {len(words)} values; its header declares others")
+        if place != len(parts):
+            raise _fault(path, f"line {number + 1} of an element has {len(parts)} values; its header declares others")
     for one, column in zip(properties, columns, strict=True):
         try:
             if one.length is not None:

@@ -168,9 +168,9 @@ def _find_alternation(poses: np.ndarray) -> list[str]:
         return []
     axes = (poses[:, :3, 3] + _REACH_MM * poses[:, :3, axis] for axis in (0, 1))
     places = np.concatenate([poses[:, :3, 3], *axes], axis=1)
-    steps, apart = (np.linalg.norm(places[lag:] - places[:-lag], axis=1) for lag in (1, 2))
-    away = np.minimum(steps[:-1], steps[1:])
-    jumps = (apart < _RETURNED * away) & (away > _LEAST_JUMP_MM)
+    steps, double_steps = (np.linalg.norm(places[lag:] - places[:-lag], axis=1) for lag in (1, 2))
+    shorter = np.minimum(steps[:-1], steps[1:])
+    jumps = (double_steps < _RETURNED * shorter) & (shorter > _LEAST_JUMP_MM)
     # Every second pose lies on a smooth path of its own, also if the offset is along the path.
     bent = np.linalg.norm(np.diff(places, 2, axis=0), axis=1)[1:-1]
     smooth = np.linalg.norm(places[4:] - 2 * places[2:-2] + places[:-4], axis=1)

@@ -94,13 +94,13 @@ class ChessboardTarget(Target):
         return TargetView(pixels, self.points_at(indices), indices, measure_corners(image, pixels))
 
 
-def _by_lattice(grey: np.ndarray, columns: int, rows: int) -> np.ndarray | None:
+def _find_by_lattice(grey: np.ndarray, columns: int, rows: int) -> np.ndarray | None:
     from uwlts.targets.detection import find_board
 
     return find_board(grey, columns, rows)
 
 
-def _by_opencv(
+def _find_by_opencv(
     find: Callable[..., tuple[bool, np.ndarray]], flags: int, grey: np.ndarray, columns: int, rows: int
 ) -> np.ndarray | None:
     # The same random numbers for every image.
@@ -110,9 +110,9 @@ def _by_opencv(
 
 
 _DETECTORS = {
-    "its saddle points": _by_lattice,
-    "OpenCV's sectors": partial(_by_opencv, cv2.findChessboardCornersSB, _SECTOR_FLAGS),
-    "OpenCV's squares": partial(_by_opencv, cv2.findChessboardCorners, _QUAD_FLAGS),
+    "its saddle points": _find_by_lattice,
+    "OpenCV's sectors": partial(_find_by_opencv, cv2.findChessboardCornersSB, _SECTOR_FLAGS),
+    "OpenCV's squares": partial(_find_by_opencv, cv2.findChessboardCorners, _QUAD_FLAGS),
 }
 """Detectors of corners (rows, columns, 2) with NaN for missing corners; they return None if they find no board."""
 _NEARLY_WHOLE = 0.8  # fraction of found corners above which no further detector is tried
@@ -162,7 +162,7 @@ class CharucoTarget(Target):
     legacy: bool = False
 
     @model_validator(mode="after")
-    def _consistent(self) -> Self:
+    def _check_consistent(self) -> Self:
         if self.marker_mm >= self.square_mm:
             raise ValueError(f"marker_mm is {self.marker_mm}; expected less than square_mm, {self.square_mm}")
         known = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]

@@ -49,7 +49,7 @@ class CircleTarget(Target):
     marker_y: Place = (0, 2)
 
     @model_validator(mode="after")
-    def _consistent(self) -> Self:
+    def _check_consistent(self) -> Self:
         if self.diameter_mm >= min(self.spacing_x_mm, self.spacing_y_mm):
             raise ValueError(
                 f"diameter_mm is {self.diameter_mm}; expected less than the spacing of {self.spacing_x_mm} x "
@@ -206,7 +206,7 @@ class CircleGridTarget(Target):
     CALIB_CB_ASYMMETRIC_GRID)."""
 
     @model_validator(mode="after")
-    def _consistent(self) -> Self:
+    def _check_consistent(self) -> Self:
         if self.asymmetric and isinstance(self.pitch_mm, tuple):
             raise ValueError(f"pitch_mm is {self.pitch_mm}; expected one number for an asymmetric grid")
         if self.diameter_mm >= self.spacing_mm:

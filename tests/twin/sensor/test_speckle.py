@@ -12,7 +12,7 @@ import pytest
 from scipy import integrate, interpolate, special, stats
 
 from tests.virtual_sensors import altered
-from twin.sensor.speckle import Speckle, _third_of_pixel, coherence, pixel_contrast, renewal_correlation
+from twin.sensor.speckle import Speckle, _compute_third_cumulant, coherence, pixel_contrast, renewal_correlation
 from uwlts.errors import DesignError
 from uwlts.model.sensor import Camera, Sensor
 
@@ -188,7 +188,7 @@ def test_cumulants_of_a_pixel_by_another_quadrature():
         distances = [np.hypot(*(points[i] - points[j]).T) / grain for i, j in ((0, 1), (1, 2), (2, 0))]
         product = np.prod([2 * special.j1(np.pi * d) / (np.pi * d) for d in distances], axis=0)
         scatter = product.std() / math.sqrt(len(product))
-        assert _third_of_pixel(grain) == pytest.approx(product.mean(), abs=5 * scatter)
+        assert _compute_third_cumulant(grain) == pytest.approx(product.mean(), abs=5 * scatter)
         assert 10 * scatter < product.mean()
 
 

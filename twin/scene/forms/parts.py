@@ -60,7 +60,7 @@ class Weld(FreeForm):
         return self.width_mm * (0.5 + 1.5 * self.irregularity) + groove
 
     @model_validator(mode="after")
-    def _beads_have_room(self) -> "Weld":
+    def _check_room(self) -> "Weld":
         plate = self.plate_mm if self.along == "x" else self.plate_mm[::-1]
         wide = (self.beads - 1) * self.spacing_mm + 2 * self.bead_reach_mm()
         if self.length_mm < self.width_mm:
@@ -173,7 +173,7 @@ class PittedPipe(FreeForm):
     seed: Annotated[int, Field(ge=0)] = 0
 
     @model_validator(mode="after")
-    def _has_room_for_pits(self) -> Self:
+    def _check_pits(self) -> Self:
         if self.pit_diameter_mm > min(self.length_mm, self.diameter_mm / 2):
             raise ValueError(
                 f"pit_diameter_mm {self.pit_diameter_mm:g} is more than length_mm {self.length_mm:g}, or than half of "
@@ -185,7 +185,7 @@ class PittedPipe(FreeForm):
             )
         if self.pit_gap_mm is not None:
             disc = self.pits * np.pi / 4 * (self.pit_diameter_mm + self.pit_gap_mm) ** 2
-            share = disc / float(np.prod(2 * np.array(_pitted_area(self)) * (1, self.diameter_mm / 2)))
+            share = disc / float(np.prod(2 * np.array(_find_pitted_area(self)) * (1, self.diameter_mm / 2)))
             if share > _MOST_COVERED:
                 raise ValueError(
                     f"pits {self.pits} of {self.pit_diameter_mm:g} mm with a pit_gap_mm of {self.pit_gap_mm:g} would "
@@ -224,15 +224,15 @@ class PittedPipe(FreeForm):
 
 def pit_places(pipe: PittedPipe) -> np.ndarray:
     """Return positions (pits, 2) of the centres of a pipe's pits: x in mm, and the angle in rad from -z towards y."""
-    most, rng = _pitted_area(pipe), np.random.default_rng(pipe.seed)
+    most, rng = _find_pitted_area(pipe), np.random.default_rng(pipe.seed)
     if pipe.pit_gap_mm is None:
         return rng.uniform(-1, 1, (pipe.pits, 2)) * most
     # A candidate too near to earlier pits is drawn again; the limit of the covered area leaves room for all.
     places, scale = np.zeros((0, 2)), np.array([1.0, pipe.diameter_mm / 2])
     while len(places) < pipe.pits:
         drawn = rng.uniform(-1, 1, (1, 2)) * most
-        apart = np.linalg.norm((places - drawn) * scale, axis=1)
-        if not (apart < pipe.pit_diameter_mm + pipe.pit_gap_mm).any():
+        distance = np.linalg.norm((places - drawn) * scale, axis=1)
+        if not (distance < pipe.pit_diameter_mm + pipe.pit_gap_mm).any():
             places = np.concatenate([places, drawn])
     return places
 
@@ -246,7 +246,7 @@ def pit_depths(pipe: PittedPipe) -> np.ndarray:
     return np.exp(np.interp(share, [0, 1], np.log(pipe.pit_depth_mm)))
 
 
-def _pitted_area(pipe: PittedPipe) -> tuple[float, float]:
+def _find_pitted_area(pipe: PittedPipe) -> tuple[float, float]:
     """Return the largest x in mm and angle in rad of a pit's centre."""
     return 0.5 * (pipe.length_mm - pipe.pit_diameter_mm), float(np.radians(_PITTED_DEG))
 
@@ -294,7 +294,7 @@ class Flange(FreeForm):
     flatness_mm: NotNegative = 0.0
 
     @model_validator(mode="after")
-    def _has_room(self) -> Self:
+    def _check_holes(self) -> Self:
         if self.bore_diameter_mm >= self.outer_diameter_mm:
             raise ValueError(
                 f"bore_diameter_mm {self.bore_diameter_mm:g} is not smaller than outer_diameter_mm "

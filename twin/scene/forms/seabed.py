@@ -34,7 +34,7 @@ class Seabed(FreeForm):
     seed: Annotated[int, Field(ge=0)] = 0
 
     @model_validator(mode="after")
-    def _stones_fit(self) -> Self:
+    def _check_stones(self) -> Self:
         if self.stone_diameter_mm > min(self.width_mm, self.height_mm):
             raise ValueError(
                 f"stone_diameter_mm {self.stone_diameter_mm:g} is more than width_mm {self.width_mm:g} or height_mm "
@@ -72,10 +72,10 @@ class Seabed(FreeForm):
         vertices = [np.stack([x, y, -_sediment_height(self, x, y)], axis=-1).reshape(-1, 3)]
         faces, used = [grid_faces(x.shape)], x.size
         for place, diameter in zip(self.stone_places(), diameters, strict=True):
-            own, facets = _stone(diameter)
-            vertices.append(own + (*place, 0.0))
+            points, facets = _stone(diameter)
+            vertices.append(points + (*place, 0.0))
             faces.append(facets + used)
-            used += len(own)
+            used += len(points)
         return np.concatenate(vertices), np.concatenate(faces)
 
 

@@ -174,7 +174,7 @@ def placements(images: Sequence[TargetImage], *, approaching: bool | None) -> li
     numbers = [index if approaching is None else image.placement for index, image in enumerate(images)]
     joined = []
     for number in sorted(set(numbers)):
-        group = [index for index, own in enumerate(numbers) if own == number]
+        group = [index for index, each in enumerate(numbers) if each == number]
         members = [images[index] for index in group]
         counts = [len(member.points_mm) for member in members]
         facing = {z_away(member) for member in members}

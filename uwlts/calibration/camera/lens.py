@@ -125,7 +125,7 @@ class LensCalibration:
 
     def widest_deg(self) -> float:
         """Return the largest angle of a target point to the camera's axis, deg."""
-        return _widest_deg(self.images, self.solution)
+        return _find_widest_deg(self.images, self.solution)
 
     def std(self) -> dict[str, float]:
         """Return the standard uncertainty of every estimated parameter."""
@@ -142,18 +142,18 @@ class LensCalibration:
         for name, std in self.std().items() if values else ():
             one, two = (each[name] for each in values)
             digits = 6 if name in DISTORTION else 2
-            doubts += half_doubt(f"{name} is {one:.{digits}f} and {two:.{digits}f}", apart=abs(two - one), std=std)
+            doubts += half_doubt(f"{name} is {one:.{digits}f} and {two:.{digits}f}", difference=abs(two - one), std=std)
         return doubts
 
 
-def half_doubt(found: str, *, apart: float, std: float) -> list[str]:
+def half_doubt(found: str, *, difference: float, std: float) -> list[str]:
     """Return a warning if two half-sample estimates differ by more than the standard uncertainty ``std`` allows.
 
     The difference of independent halves has twice the standard uncertainty of the full sample.
     """
-    if apart <= HALVES_APART * 2 * std:
+    if difference <= HALVES_APART * 2 * std:
         return []
-    sigmas = apart / (2 * std)
+    sigmas = difference / (2 * std)
     return [
         f"two halves of the images disagree: {found}, which differ by {sigmas:.1f} standard uncertainties of this "
         "difference: uncertainties are larger than stated"
@@ -190,7 +190,7 @@ def calibrate_lens(
     usual = tried[0] if len(tried) == 1 else _candidates((_USUAL,), replace(choice, distortion="auto"), poses)[0]
 
     plain = solve(images, options=usual)
-    wide = choice.distortion == "auto" and poses != "stage-normal" and _widest_deg(images, plain) > WIDE_DEG
+    wide = choice.distortion == "auto" and poses != "stage-normal" and _find_widest_deg(images, plain) > WIDE_DEG
     if wide:
         usual = replace(usual, distortion=_WIDE_USUAL)
         plain = solve(images, options=usual)
@@ -255,7 +255,7 @@ def calibrate_lens(
         without = _solve_subsets(centred, solution, all_but_one, solved_again)
         values, none = intrinsics.from_model(solution.model), np.full(len(intrinsics.names), np.nan)
         changes = np.array([none if s is None else intrinsics.from_model(s.model) - values for s in without])
-        others_std = np.array([none if s is None else _expected_std(s) for s in without])
+        others_std = np.array([none if s is None else _compute_std(s) for s in without])
         if not np.isfinite(changes).any():
             moved = np.full(len(used), np.nan)
             break
@@ -301,7 +301,7 @@ def _candidates(any_of: Sequence[tuple[str, ...]], choice: LensChoice, poses: Po
     return [CameraOptions(names, pixel_aspect=shape) for names in sets for shape in shapes]
 
 
-def _widest_deg(images: Sequence[TargetImage], solution: CameraSolution) -> float:
+def _find_widest_deg(images: Sequence[TargetImage], solution: CameraSolution) -> float:
     """Return the largest angle of a target point to the camera's axis, deg, from the points' poses."""
     seen = [i.points_mm @ pose[:3, :3].T + pose[:3, 3] for i, pose in zip(images, solution.target_poses, strict=True)]
     points = np.vstack(seen)
@@ -314,7 +314,7 @@ def _scatter(solution: CameraSolution) -> float:
     return float(np.median(np.linalg.norm(np.vstack(solution.residuals_px), axis=1))) / 1.1774
 
 
-def _expected_std(solution: CameraSolution) -> np.ndarray:
+def _compute_std(solution: CameraSolution) -> np.ndarray:
     """Return the standard deviations (P,) of the parameters, for points that scatter by at least `_FINEST_PX`."""
     larger = max(_FINEST_PX / max(solution.sigma_px, _LEAST_SCATTER_PX), 1.0)
     return larger * np.sqrt(np.diag(solution.covariance))
@@ -353,10 +353,10 @@ def compare_models(squares: dict[CameraOptions, np.ndarray], *, least_gain: floa
     best = next(squares[options] for options, mean in means.items() if mean == least)
     found = []
     for options, each in squares.items():
-        apart = each - best
-        error = float(np.std(apart, ddof=1)) / np.sqrt(len(apart))
+        difference = each - best
+        error = float(np.std(difference, ddof=1)) / np.sqrt(len(difference))
         small = means[options] - least <= least_gain * least
-        worse = 0.0 if small else np.inf if np.isnan(means[options]) else float(np.mean(apart)) / error
+        worse = 0.0 if small else np.inf if np.isnan(means[options]) else float(np.mean(difference)) / error
         found.append(LensCandidate(options, float(np.sqrt(means[options])), worse))
     return found
 

@@ -21,7 +21,7 @@ from uwlts.calibration.camera.lens import (
 )
 from uwlts.errors import CalibrationError, DescriptionError, ImageError, TargetError
 from uwlts.files.reading import is_regular_file
-from uwlts.files.writing import write_atomically
+from uwlts.files.writing import write_file
 from uwlts.model.library import read_table
 from uwlts.model.short_text import Brief
 from uwlts.runtime.progress import ProgressListener, ignore_progress
@@ -105,8 +105,7 @@ class CameraCalibration(Brief):
                 "left_out": {each.name: each.reason for each in self.photographs if each.reason is not None},
             },
         }
-        with write_atomically(path, overwrite=overwrite) as aside:
-            aside.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
+        write_file(path, yaml.safe_dump(content, sort_keys=False, allow_unicode=True), overwrite=overwrite)
 
 
 def calibrate_camera(
@@ -171,7 +170,7 @@ def calibrate_camera(
             reasons[name] = str(error).replace(f"{folder / name}", "it").removeprefix(f"{name} ")
         progress(number + 1, len(names), "target")
     # Images of another size are from another camera.
-    size = Counter(own for own, _ in seen.values()).most_common(1)[0][0] if seen else (0, 0)
+    size = Counter(shape for shape, _ in seen.values()).most_common(1)[0][0] if seen else (0, 0)
     for number, ((width, height), _) in list(seen.items()):
         if (width, height) != size:
             reasons[names[number]] = f"it has {width} x {height} pixels; most images have {size[0]} x {size[1]}"
@@ -179,10 +178,10 @@ def calibrate_camera(
     found, places = [image for _, image in seen.values()], list(seen)
     photographs = [Photograph(name, np.empty((0, 2)), reason) for name, reason in reasons.items()]
     if len(found) < _FEWEST_IMAGES:
-        said = "; ".join(f"{name}: {reason}" for name, reason in reasons.items() if reason)
+        listed = "; ".join(f"{name}: {reason}" for name, reason in reasons.items() if reason)
         raise CalibrationError(
             f"the target was found in {len(found)} of {len(names)} images, at least {_FEWEST_IMAGES} are needed"
-            + (f": {said[:600]}" if said else "")
+            + (f": {listed[:600]}" if listed else "")
         )
     lens = calibrate_lens(
         found,

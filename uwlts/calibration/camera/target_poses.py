@@ -264,7 +264,7 @@ def solve_camera(
 def _prior_observation(intrinsics: Intrinsics, global_values: np.ndarray) -> Observation:
     """Return the prior knowledge of p1 and p2 as residuals in px."""
     std, sigma_px = intrinsics.options.tangential or (math.inf, 0.0)
-    by_global = np.array([[float(name == own) for name in intrinsics.names] for own in ("p1", "p2")]) * (sigma_px / std)
+    by_global = np.array([[float(name == key) for name in intrinsics.names] for key in ("p1", "p2")]) * (sigma_px / std)
     return Observation(by_global @ global_values[:, None], by_global, np.empty((2, 0)))
 
 
@@ -330,8 +330,8 @@ def _solution(
     target_poses, directions, tilts = np.tile(np.eye(4), (len(images), 1, 1)), [], []
     residuals = [np.empty((0, 2))] * len(images)
     # Prior knowledge is the last group, after those of the views.
-    own = (each[: len(views)] for each in (fit.local, fit.local_covariances, fit.residuals))
-    for view, local, covariance, misses in zip(views, *own, strict=True):
+    per_image = (each[: len(views)] for each in (fit.local, fit.local_covariances, fit.residuals))
+    for view, local, covariance, misses in zip(views, *per_image, strict=True):
         rotation = cv2.Rodrigues(local[:3])[0]
         directions.append(rotation @ view.direction(local[6:]))
         for index in np.unique(view.image):

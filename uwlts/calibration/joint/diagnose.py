@@ -133,8 +133,8 @@ class Findings:
         """Return an error message with the most severe findings."""
         every = self.all_against()
         more = len(every) - _MOST_SAID
-        said = "; ".join(every[:_MOST_SAID])
-        return f"the evidence contradicts itself: {said}" + (f"; and {more} more contradictions" if more > 0 else "")
+        text = "; ".join(every[:_MOST_SAID])
+        return f"the evidence contradicts itself: {text}" + (f"; and {more} more contradictions" if more > 0 else "")
 
 
 _Found = Iterator[tuple[bool, str]]
@@ -179,19 +179,19 @@ def check_consistency(result: Estimate, evidence: Sequence[Evidence], *, sensor:
     earlier = [] if any(wrong for wrong, _ in known + lens) else [*_check_earlier(result)]
     unfit, noisy = _check_images(images)
     misfits, waves = _check_kinds(images), [*_check_correlations(result)]
-    for wrong, kind, words in waves:
+    for wrong, kind, text in waves:
         if wrong:
-            misfits[kind] = "; ".join(filter(None, [misfits.get(kind), words]))
+            misfits[kind] = "; ".join(filter(None, [misfits.get(kind), text]))
     found = [*known, *earlier, *lens]
-    doubts = [words for wrong, words in found if not wrong] + noisy
-    doubts += [words for wrong, _, words in waves if not wrong]
+    doubts = [text for wrong, text in found if not wrong] + noisy
+    doubts += [text for wrong, _, text in waves if not wrong]
     doubts += [
         f"{100 * share:.0f} % of the {kind} was left out as outliers: look at the images"
         for kind, share in find_excess_outliers(result).items()
     ]
     if result.stopped == UNSETTLED:
         doubts.append(f"{UNSETTLED}: some of the evidence contradicts the rest")
-    return Findings([words for wrong, words in found if wrong], unfit, misfits, doubts)
+    return Findings([text for wrong, text in found if wrong], unfit, misfits, doubts)
 
 
 @dataclass(frozen=True)
@@ -348,10 +348,10 @@ def describe_wrong_sizes(deviations: Sequence[SizeDeviation], *, least: float = 
         return []
     share, std = np.array([(each.off_mm, each.off_std_mm) for each in known]).T / [each.described_mm for each in known]
     common = float(np.sum(share / std**2) / np.sum(1 / std**2))
-    words = _shorten_list(each.words() for each in far)
+    text = _shorten_list(each.words() for each in far)
     if len(known) > 1 and np.all(np.abs(share - common) < _ALIKE * std):
-        words.append(f"all known sizes are off by the same {100 * common:+.2f} %: also check the target's spacings")
-    return words
+        text.append(f"all known sizes are off by the same {100 * common:+.2f} %: also check the target's spacings")
+    return text
 
 
 def _check_earlier(result: Estimate) -> _Found:
@@ -411,9 +411,9 @@ def _check_stage(result: Estimate, evidence: Sequence[Evidence], sensor: Sensor)
         rms = float(np.sqrt(np.mean(errors**2)))
         if 0 < wrong.sum() <= max(1, len(errors) // 4):
             stood = zip((piece.sources[image] for image in images[wrong]), errors[wrong], strict=True)
-            said = f"mm from its stated position (stated uncertainty {std:g} mm)"
-            for words in _shorten_list(f"{source}: the stage was {error:+.3f} {said}" for source, error in stood):
-                yield True, words
+            stated = f"mm from its stated position (stated uncertainty {std:g} mm)"
+            for text in _shorten_list(f"{source}: the stage was {error:+.3f} {stated}" for source, error in stood):
+                yield True, text
         elif len(errors) >= _FEWEST_POSITIONS and rms > _POSITIONS_WRONG * std:
             yield (
                 True,
@@ -439,11 +439,11 @@ def _check_images(images: Sequence[_Image]) -> tuple[dict[str, str], list[str]]:
             continue
         shaped = image.scatter_px > _OVER_NOISE * image.noise_px
         than = f"in the other images {usual:.2f} px" if len(others) else f"its noise being {usual:.2f} px"
-        words = f"{image.source}: the {image.kind} is {image.scatter_px:.2f} px off (rms), {than}"
+        text = f"{image.source}: the {image.kind} is {image.scatter_px:.2f} px off (rms), {than}"
         if shaped or image.scatter_px > image.largest_px():
-            unfit.setdefault(image.source, words)
+            unfit.setdefault(image.source, text)
         else:
-            noisy.append(words)
+            noisy.append(text)
     return unfit, _shorten_list(noisy)
 
 

@@ -161,7 +161,7 @@ def estimate_series_start(
         except CalibrationError:  # coefficients that are not determined start at zero
             seen = solve(base.found.images, options=replace(camera, distortion=()))
         rms = seen.image_rms_px()
-        if base.view == ViewMedium(False, None) and not np.median(rms) <= _largest_misfit_px(seen.model.fx_px):
+        if base.view == ViewMedium(False, None) and not np.median(rms) <= _find_misfit_px(seen.model.fx_px):
             raise CalibrationError(
                 f"no camera fits the target images in air: the median residual is {np.median(rms):.1f} px (rms), and "
                 f"{rms.max():.1f} px in {base.found.names()[np.argmax(rms)]}: check the target's spacing, the stage's "
@@ -197,7 +197,7 @@ def _camera_solver(series: Series, sensor: Sensor, options: CalibrationOptions) 
     )
 
 
-def _largest_misfit_px(focal_px: float) -> float:
+def _find_misfit_px(focal_px: float) -> float:
     return max(_LARGEST_MISFIT_PX, _LARGEST_MISFIT * focal_px)
 
 
@@ -218,7 +218,7 @@ def find_odd_images(series: Series, sensor: Sensor, *, options: CalibrationOptio
 
     draws = rng.permuted(np.tile(np.arange(len(images)), (_DRAWS, 1)), axis=1)[:, :_DRAWN].tolist()
     agree_px, best = min((misfit_px(draw), draw) for draw in draws)
-    if agree_px > _largest_misfit_px(sensor.camera.focal_length_px()):
+    if agree_px > _find_misfit_px(sensor.camera.focal_length_px()):
         return {}
     off_px = {name: misfit_px({*best, number}) for number, name in enumerate(series.found.names())}
     return {

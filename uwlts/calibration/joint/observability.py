@@ -130,9 +130,9 @@ def project_sheet_points(known: StoredEstimate, at_mm: np.ndarray) -> np.ndarray
 
 def compute_lengths(points: SheetSamples, start: np.ndarray, end: np.ndarray) -> Lengths:
     """Return lengths between points, given by their numbers (M,)."""
-    apart = points.at_mm[end] - points.at_mm[start]
-    length = np.linalg.norm(apart, axis=1)
-    unit = apart / length[:, None]
+    difference = points.at_mm[end] - points.at_mm[start]
+    length = np.linalg.norm(difference, axis=1)
+    unit = difference / length[:, None]
     moved = points.by_parameters[end, 1:] - points.by_parameters[start, 1:]
     by_px = [np.einsum("mi,mi->m", unit, points.by_px[side, 1:]) for side in (start, end)]
     ends = np.stack([points.at_mm[start], points.at_mm[end]], axis=1)

@@ -199,20 +199,20 @@ def _judge_form(problem: JointProblem, seen: PriorDeviations, near: Estimate) ->
     form, known = seen.form(), problem.parameters
     scaled = {key: replace(prior, std=seen.birge_ratio * prior.std) for key, prior in known.priors.items()}
     priors, off = dict(scaled), {each.key: abs(each.alone - each.known) for each in seen.of_target()}
-    for alike in (BENDS, STRETCH):
-        if any(each.key in alike for each in form):
-            together = sum(off.get(key, 0.0) for key in alike)
-            priors |= {key: replace(priors[key], std=max(priors[key].std, together)) for key in alike}
+    for likely in (BENDS, STRETCH):
+        if any(each.key in likely for each in form):
+            together = sum(off.get(key, 0.0) for key in likely)
+            priors |= {key: replace(priors[key], std=max(priors[key].std, together)) for key in likely}
     wider = replace(known, priors=priors)
     halves = _compare_halves_of_form(replace(problem, parameters=wider), near) if form else []
     times = {each: priors[each.key].std / scaled[each.key].std for each in form}
     refused = {each: many for each, many in times.items() if many > _MOST_WIDENED or halves is None}
     tied = {}
-    for alike in (BENDS, STRETCH):
-        if any(each.key in alike for each in (*(halves or ()), *refused)):
+    for likely in (BENDS, STRETCH):
+        if any(each.key in likely for each in (*(halves or ()), *refused)):
             # The stated uncertainty is multiplied by the deviation's ratio to it (Birge's ratio of one value).
-            less_sure = max((each.sigmas for each in form if each.key in alike), default=1.0)
-            tied |= {key: less_sure for key in alike if key in known.keys}
+            less_sure = max((each.sigmas for each in form if each.key in likely), default=1.0)
+            tied |= {key: less_sure for key in likely if key in known.keys}
     if tied:
         stated = {key: replace(scaled[key], std=less_sure * scaled[key].std) for key, less_sure in tied.items()}
         wider = replace(known, priors=priors | stated, tied=frozenset(tied))
@@ -251,10 +251,10 @@ class _Attempt:
     said: tuple[str, ...]
 
     @classmethod
-    def solve(cls, gathered: Gathered, options: CalibrationOptions, said: tuple[str, ...] = ()) -> Self:
+    def solve(cls, gathered: Gathered, options: CalibrationOptions, text: tuple[str, ...] = ()) -> Self:
         """Solve the problem for this evidence and these options."""
         problem = joint_problem(gathered, options=options)
-        return cls(gathered, options, problem, *solve_and_check(problem), said)
+        return cls(gathered, options, problem, *solve_and_check(problem), text)
 
     def improve(self) -> "_Attempt":
         """Change the problem by all rules in turn; contradictions of the description remain."""
@@ -268,15 +268,15 @@ class _Attempt:
                 break
         return attempt
 
-    def _without_unfit(self) -> "_Attempt | None":
+    def _drop_unfit(self) -> "_Attempt | None":
         """Remove the images that contradict all others; None if too few remain, or more contradictions appear."""
         if not self.against.unfit or (kept := self.gathered.remove_images(self.against.unfit)) is None:
             return None
-        said = [f"{words}; left out" for words in self.against.unfit.values()]
-        fewer = _Attempt.solve(kept, self.options, (*self.said, *said))
+        texts = [f"{text}; left out" for text in self.against.unfit.values()]
+        fewer = _Attempt.solve(kept, self.options, (*self.said, *texts))
         return None if fewer.against.contradictions else fewer
 
-    def _with_better_lens(self) -> "_Attempt":
+    def _try_lenses(self) -> "_Attempt":
         """Try more distortion coefficients, free pixel shape, or both, if something is odd.
 
         Only parameters that the options leave open are changed. The pixel shape of a sensor on a stage is not freed for
@@ -295,20 +295,20 @@ class _Attempt:
             chosen = self._select_lens(lenses)
             if "k3" in chosen.distortion and odd:
                 chosen = self._select_lens([chosen, *(replace(chosen, distortion=names) for names in RATIONAL)])
-            best = self._with_lens(chosen) or self if chosen != camera else self
+            best = self._use_lens(chosen) or self if chosen != camera else self
         if any(isinstance(each.key, LensParameter) and each.wrong() for each in deviations(best.result)):
             # Before the usual size of p1 and p2 refuses anything, they are free.
             freer = replace(camera, distortion=tuple(dict.fromkeys((*best.options.camera.distortion, "p1", "p2"))))
-            freed = (best._with_lens(replace(freer, pixel_aspect=shape)) for shape in shapes)
+            freed = (best._use_lens(replace(freer, pixel_aspect=shape)) for shape in shapes)
             best = next((each for each in freed if each is not None), best)
         if choice.pixels == "auto" and not free_pixels:
             if best.against.misfits:
-                free = best._with_lens(replace(best.options.camera, pixel_aspect=None))
+                free = best._use_lens(replace(best.options.camera, pixel_aspect=None))
                 best = (
                     free if free is not None and _scatter(free.result) < _CLEARLY_LESS * _scatter(best.result) else best
                 )
             best = best._describe_lens(camera)
-            return best._with_spacings_and_pixels_free() or best
+            return best._free_spacings_and_pixels() or best
         return best._describe_lens(camera)
 
     def _select_lens(self, lenses: Sequence[CameraOptions]) -> CameraOptions:
@@ -330,10 +330,10 @@ class _Attempt:
         camera = self.options.camera
         given = [name for name in camera.distortion if name not in before.distortion]
         given += ["free pixels"] if camera.pixel_aspect != before.pixel_aspect else []
-        said = f"{', '.join(given)} were added to the lens: images are predicted better, or not refused, with them"
-        return replace(self, said=(*self.said, said)) if given else self
+        text = f"{', '.join(given)} were added to the lens: images are predicted better, or not refused, with them"
+        return replace(self, said=(*self.said, text)) if given else self
 
-    def _with_spacings_and_pixels_free(self) -> "_Attempt | None":
+    def _free_spacings_and_pixels(self) -> "_Attempt | None":
         """Estimate the target's spacings and the pixel shape; None if the spacings are as described.
 
         On a stage, wrong spacings along one side have the same effect as pixels of another shape. Only placements of
@@ -347,15 +347,15 @@ class _Attempt:
         uncertainty = self.gathered.sensor.uncertainty.model_copy(update=known)
         sensor = self.gathered.sensor.model_copy(update={"uncertainty": uncertainty})
         camera = replace(self.options.camera, pixel_aspect=None)
-        freed = replace(self, gathered=replace(self.gathered, sensor=sensor))._with_lens(camera)
-        said = (
+        freed = replace(self, gathered=replace(self.gathered, sensor=sensor))._use_lens(camera)
+        text = (
             f"the target's spacings are off by {' and '.join(f'{1e6 * value:+.0f}' for value in found)} µm/m along "
             "rows and columns, or the pixels' shape is not as described: both are estimated. To distinguish them, use "
             "placements of the target rotated by 90° against each other, or set `pixels` to square or free"
         )
-        return None if freed is None else replace(freed, said=(*freed.said, said))
+        return None if freed is None else replace(freed, said=(*freed.said, text))
 
-    def _with_lens(self, camera: CameraOptions) -> "_Attempt | None":
+    def _use_lens(self, camera: CameraOptions) -> "_Attempt | None":
         """Solve with another lens; None if it is not determined, or the evidence contradicts the description."""
         try:
             richer = _Attempt.solve(self.gathered, replace(self.options, camera=camera), self.said)
@@ -363,7 +363,7 @@ class _Attempt:
             return None
         return None if richer.against.contradictions else richer
 
-    def _with_error_of_model(self) -> "_Attempt | None":
+    def _add_error_of_model(self) -> "_Attempt | None":
         """Count all residuals of an image as one if images show systematic deviations, or their halves disagree.
 
         An incomplete model also biases lens and poses, so that kinds of residuals that fit well are affected too.
@@ -382,15 +382,15 @@ class _Attempt:
         result, against = solve_and_check(problem)
         result = result.no_surer_than(self.result)
         factor = float(np.median(list(result.std().values()) / np.sqrt(np.diag(self.result.covariance))))
-        said = [each.words() for each in sorted(halves, key=HalfDifference.sigmas, reverse=True)[:_MOST_HALVES]]
-        said += [f"{words}; kept, as too many images are like this" for words in self.against.unfit.values()]
-        said += [*self.against.misfits.values(), *self.against.judged]
-        said.append(
+        texts = [each.words() for each in sorted(halves, key=HalfDifference.sigmas, reverse=True)[:_MOST_HALVES]]
+        texts += [f"{text}; kept, as too many images are like this" for text in self.against.unfit.values()]
+        texts += [*self.against.misfits.values(), *self.against.judged]
+        texts.append(
             "images show systematic deviations from the model: all points of an image count as one, which makes "
             f"uncertainties {factor:.1f} times larger (median)"
         )
         against = replace(against, unfit={}, misfits={})
-        return replace(self, problem=problem, result=result, against=against, said=(*self.said, *said))
+        return replace(self, problem=problem, result=result, against=against, said=(*self.said, *texts))
 
 
 def _solve_first(gathered: Gathered, options: CalibrationOptions) -> _Attempt:
@@ -404,18 +404,18 @@ def _solve_first(gathered: Gathered, options: CalibrationOptions) -> _Attempt:
         kept = gathered.remove_images(odd) if odd and not options.strict else None
         if kept is None:
             raise CalibrationError("; ".join([str(refusal), *odd.values()])) from refusal
-        return _Attempt.solve(kept, options, tuple(f"{words}; left out" for words in odd.values()))
+        return _Attempt.solve(kept, options, tuple(f"{text}; left out" for text in odd.values()))
 
 
 # Changes of the problem, and how often each is made at most, in the order in which they change least of what was
 # described. They return None if nothing calls for them.
 _RULES: tuple[tuple[Callable[[_Attempt], _Attempt | None], int], ...] = (
     # Other coefficients or another pixel shape, if something is odd and the options leave the lens open.
-    (_Attempt._with_better_lens, 1),
+    (_Attempt._try_lenses, 1),
     # Images that contradict all others are left out; what remains after three rounds has another cause.
-    (_Attempt._without_unfit, 3),
+    (_Attempt._drop_unfit, 3),
     # Images still show systematic deviations, or their halves disagree: all residuals of an image count as one.
-    (_Attempt._with_error_of_model, 1),
+    (_Attempt._add_error_of_model, 1),
 )
 
 

@@ -76,7 +76,7 @@ class JointProblem:
         if not self.parameters.tied:
             return result
         free = replace(self.parameters, tied=frozenset())
-        parts = [e.residuals(free, result.values, own) for e, own in zip(self.evidence, result.local, strict=True)]
+        parts = [e.residuals(free, result.values, local) for e, local in zip(self.evidence, result.local, strict=True)]
         full = replace(result, residuals=[each or [] for each in parts])
         covariance = self.linearise(full).covariance_with(self.parameters.tied)
         return replace(result, covariance=covariance, formal_covariance=result.covariance)
@@ -340,8 +340,8 @@ def compare_estimates(
     """
     one, other = values
     first, second = covariances
-    apart = first - second
-    covariance = first - first @ shared @ first + second - second @ shared @ second + apart @ shared @ apart
+    difference = first - second
+    covariance = first - first @ shared @ first + second - second @ shared @ second + difference @ shared @ difference
     variance = np.maximum(np.diag(covariance), (_LEAST_SHARE * np.minimum(np.diag(first), np.diag(second))))
     columns = zip(keys, one.tolist(), other.tolist(), np.sqrt(variance).tolist(), strict=True)
     return [HalfDifference(*each) for each in columns]

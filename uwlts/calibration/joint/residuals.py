@@ -274,8 +274,8 @@ class TargetEvidence(StripeEvidence):
         """Return the residuals of target points and stripe for each image; None if a ray misses the target."""
         found: list[Residuals] = []
         sheet = self.on_sheet(parameters, global_values, shifted_px=parameters.value(global_values, SHIFT))
-        of_stripe = partial(self._of_stripe, sheet)
-        for of_kind, image in ((self._of_points, self.placement.image), (of_stripe, self.image)):
+        of_stripe = partial(self._take_stripe, sheet)
+        for of_kind, image in ((self._take_points, self.placement.image), (of_stripe, self.image)):
             for here in _split_batches(image):
                 pose = _Poses(self, parameters, global_values, local, image[here])
                 if (parts := of_kind(parameters, global_values, pose, here)) is None:
@@ -290,7 +290,7 @@ class TargetEvidence(StripeEvidence):
                 points[of_image[part.image]] -= np.where(kept, part.values, 0.0).reshape(-1, 2)
         return replace(super().linearise(residuals, used), predicted_points=points)
 
-    def _of_points(
+    def _take_points(
         self, parameters: Parameters, global_values: np.ndarray, pose: "_Poses", here: np.ndarray
     ) -> list[Residuals] | None:
         """Return the residuals of some target points (n,), image after image."""
@@ -333,7 +333,7 @@ class TargetEvidence(StripeEvidence):
         by_local = to_pixels(flat(pose.by_local(at)).transpose(1, 2, 0))
         return pose.split_by_image(TARGET, values, to_pixels(by_global), by_local)
 
-    def _of_stripe(
+    def _take_stripe(
         self, sheet: SeenSheet, parameters: Parameters, global_values: np.ndarray, pose: "_Poses", here: np.ndarray
     ) -> list[Residuals] | None:
         """Return the residuals of some stripe pixels (n,), image after image."""
@@ -437,8 +437,8 @@ class _Poses:
             here = slice(rows * start, rows * end)
             place = self._place[start] if self._staged else 0
             columns = np.append(np.arange(8), 7 + place) if place else np.arange(min(8, by_local.shape[1]))
-            own = by_local[here, : len(columns)]
-            found.append(Residuals(kind, values[here], by_global[here], own, columns, int(image)))
+            by_pose = by_local[here, : len(columns)]
+            found.append(Residuals(kind, values[here], by_global[here], by_pose, columns, int(image)))
         return found
 
 

@@ -66,9 +66,9 @@ class ScannedSpheres:
 
     def distances(self, points: np.ndarray, local: np.ndarray) -> Distances:
         """Return the distances of points (3, N) of the scan's pixels, in their order."""
-        away = points - self._centres(local)[self.sphere].T
-        distance = np.linalg.norm(away, axis=0)
-        outward = away / distance
+        offset = points - self._centres(local)[self.sphere].T
+        distance = np.linalg.norm(offset, axis=0)
+        outward = offset / distance
         radius = 0.5 * (self.diameters_mm + local[3 * self.count :])[self.sphere]
         by_local, rows = np.zeros((len(distance), len(local))), np.arange(len(distance))
         for axis in range(3):
@@ -78,11 +78,11 @@ class ScannedSpheres:
 
     def sizes(self, local: np.ndarray) -> Sizes:
         """Return the described sizes; empty for a surface without a size."""
-        apart = np.diff(self._centres(local), axis=0)
-        length = np.linalg.norm(apart, axis=1)
+        differences = np.diff(self._centres(local), axis=0)
+        length = np.linalg.norm(differences, axis=1)
         by_local = np.zeros((self.count + len(length), len(local)))
         by_local[: self.count, 3 * self.count :] = np.eye(self.count)
-        for number, unit in enumerate(apart / length[:, None]):
+        for number, unit in enumerate(differences / length[:, None]):
             by_local[self.count + number, 3 * number : 3 * number + 6] = np.concatenate([-unit, unit])
         spheres = range(1, self.count + 1)
         return Sizes(
@@ -123,9 +123,9 @@ class ScannedPlane:
 
     def distances(self, points: np.ndarray, local: np.ndarray) -> Distances:
         normal, by_slopes = tilt_direction(self.normal, self.across, local[:2])
-        away = points - self.point_mm[:, None]
-        by_local = np.column_stack([(by_slopes @ away).T, np.full(points.shape[1], -1.0)])
-        return Distances(normal @ away - local[2], np.broadcast_to(normal[:, None], points.shape), by_local)
+        offset = points - self.point_mm[:, None]
+        by_local = np.column_stack([(by_slopes @ offset).T, np.full(points.shape[1], -1.0)])
+        return Distances(normal @ offset - local[2], np.broadcast_to(normal[:, None], points.shape), by_local)
 
     def sizes(self, local: np.ndarray) -> Sizes:
         return Sizes((), np.empty(0), np.empty(0), np.empty(0), np.empty((0, len(local))))
@@ -162,9 +162,9 @@ class ScannedPipe:
 
     def distances(self, points: np.ndarray, local: np.ndarray) -> Distances:
         axis, by_slopes = tilt_direction(self.axis, self.across, local[2:4])
-        away = points - (self.point_mm + local[:2] @ self.across)[:, None]
-        along = axis @ away
-        radial = away - axis[:, None] * along
+        offset = points - (self.point_mm + local[:2] @ self.across)[:, None]
+        along = axis @ offset
+        radial = offset - axis[:, None] * along
         distance = np.linalg.norm(radial, axis=0)
         outward = radial / distance
         by_slopes = -(along * (by_slopes @ outward)).T

@@ -145,10 +145,10 @@ def common_header(captures: Sequence[Capture]) -> CaptureHeader:
     for capture in captures:
         if capture.header.target is None:
             raise CalibrationError(f"{capture.path.name} does not describe its target in its header")
-        for (name, own), other in zip(arrangement(capture).items(), arrangement(first).values(), strict=True):
-            if own != other:
+        for (name, value), other in zip(arrangement(capture).items(), arrangement(first).values(), strict=True):
+            if value != other:
                 raise CalibrationError(
-                    f"{capture.path.name} does not match {first.path.name}: {name} is {own} instead of {other}"
+                    f"{capture.path.name} does not match {first.path.name}: {name} is {value} instead of {other}"
                 )
     direction = first.header.stage_direction
     if abs(direction[2]) < _ALONG_Z:
@@ -338,9 +338,9 @@ def line_domains(lines: np.ndarray, pose: np.ndarray, centres_px: np.ndarray, *,
     first, count = int(lines.min()), int(np.ptp(lines)) + 1
     domains = np.tile([np.inf, -np.inf], (count, 1))
     for number in np.unique(pose):
-        own = np.flatnonzero(pose == number)
-        own = own[np.argsort(lines[own], kind="stable")]
-        for piece in np.split(own, np.flatnonzero(np.diff(lines[own]) > largest_gap + 1) + 1):
+        members = np.flatnonzero(pose == number)
+        members = members[np.argsort(lines[members], kind="stable")]
+        for piece in np.split(members, np.flatnonzero(np.diff(lines[members]) > largest_gap + 1) + 1):
             seen = np.arange(int(lines[piece[0]]), int(lines[piece[-1]]) + 1)
             centres = np.interp(seen, lines[piece], centres_px[piece])
             part = domains[seen - first]

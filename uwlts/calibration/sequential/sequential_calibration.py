@@ -178,7 +178,7 @@ def gather(
         sensor=sensor,
         medium_kind=air[0].header.medium.kind,
         stage_direction=np.array(air[0].header.stage_direction),
-        approaching=None if options.poses == "free" else _approaching(air),
+        approaching=None if options.poses == "free" else _find_approach(air),
         air=found,
         window=steps[0].header.sensor.camera.window if steps else None,
         steps=on_steps,
@@ -198,7 +198,7 @@ def solve(evidence: Evidence, *, options: CalibrationOptions) -> CalibrationResu
     sheet = fit_sheet(
         stripe_points.points_mm, nominal_normal=pose.normal, nominal_offset_mm=float(pose.normal @ pose.origin_mm)
     )
-    figures, apart = {"camera": camera.figures()}, None
+    figures, angle = {"camera": camera.figures()}, None
     warnings = [*evidence.warnings, *doubts]
     rays = stripe_points.points_mm[:, :2] / stripe_points.points_mm[:, 2:]
     of_image = [stripe_points.image == number for number in range(len(found.stripes))]
@@ -210,13 +210,13 @@ def solve(evidence: Evidence, *, options: CalibrationOptions) -> CalibrationResu
         unit="mm",
     )
     if lens is not None:
-        sheet, apart = _add_image_uncertainty(sheet, lens, found), _angle_between_halves(sheet, lens, found)
+        sheet, angle = _add_image_uncertainty(sheet, lens, found), _angle_between_halves(sheet, lens, found)
         figures["camera"] |= _lens_figures(lens, found)
         warnings += lens.half_doubts()
-        if apart is not None:
-            words = f"their sheets differ by {np.degrees(apart):.3f} deg"
-            warnings += half_doubt(words, apart=apart, std=sheet.normal_std_rad)
-    figures["sheet"] = sheet.figures(stripe_points, apart)
+        if angle is not None:
+            text = f"their sheets differ by {np.degrees(angle):.3f} deg"
+            warnings += half_doubt(text, difference=angle, std=sheet.normal_std_rad)
+    figures["sheet"] = sheet.figures(stripe_points, angle)
     warnings += _turn_warnings(camera, sheet, evidence)
     warnings += _uncertainty_warnings(camera, sheet, sensor)
     calibration = Calibration(
@@ -363,11 +363,11 @@ def common_sensor(captures: Sequence[Capture]) -> Sensor:
         }
 
     for capture in captures[1:]:
-        own, other = optics(capture), optics(captures[0])
+        stated, other = optics(capture), optics(captures[0])
         differ = ", ".join(
-            f"its {name} is {own[name]} instead of {other[name]}"
-            for name in own
-            if own[name] != other[name] and None not in (own[name], other[name])
+            f"its {name} is {stated[name]} instead of {other[name]}"
+            for name in stated
+            if stated[name] != other[name] and None not in (stated[name], other[name])
         )
         if differ:
             camera = capture.header.sensor.camera
@@ -379,7 +379,7 @@ def common_sensor(captures: Sequence[Capture]) -> Sensor:
     return sensor
 
 
-def _approaching(air: Sequence[Capture]) -> bool:
+def _find_approach(air: Sequence[Capture]) -> bool:
     """Return whether the stage moves the sensor towards the target, which is perpendicular to the OCS's Z."""
     along = {capture.header.stage_direction[2] / np.linalg.norm(capture.header.stage_direction) for capture in air}
     if min(map(abs, along)) < 0.9 or min(along) * max(along) < 0:

@@ -97,15 +97,15 @@ class StandardTurn:
         if share * height_mm <= std_mm:
             return ""
         higher = f"appears higher by {100 * share:.2f} % or {share * height_mm:.3f} mm"
-        said = "the standard does not face the laser: it is rotated by"
+        text = "the standard does not face the laser: it is rotated by"
         if self.about_stripe is None:
             return (
-                f"{said} {np.degrees(angle):.1f}° about the sheet's normal. This does not change the height. But with "
+                f"{text} {np.degrees(angle):.1f}° about the sheet's normal. This does not change the height. But with "
                 f"the same rotation about the stripe, which these images do not show, it {higher}: make it face "
                 "the laser, or let the stage move the sensor across the stripe between three or more images"
             )
         return (
-            f"{said} {np.degrees(angle):.1f} +- {np.degrees(self.std):.1f}° about the stripe, so that it {higher}. "
+            f"{text} {np.degrees(angle):.1f} +- {np.degrees(self.std):.1f}° about the stripe, so that it {higher}. "
             "This is taken into account; to avoid it, make the standard face the laser"
         )
 
@@ -210,13 +210,13 @@ class WindowSolution:
             "heights_mm": self.heights_mm.tolist(),
             "errors_mm": self.errors_mm.tolist(),
             "height_std_mm": self.height_std_mm.tolist(),
-            "image_distances_mm": _none_for_nan(self.image_distances_mm),
-            "curve_mm": [_none_for_nan(row) for row in self.curve_mm],
+            "image_distances_mm": _replace_nan(self.image_distances_mm),
+            "curve_mm": [_replace_nan(row) for row in self.curve_mm],
             "bounds_mm": list(self.bounds_mm),
         }
 
 
-def _none_for_nan(values: np.ndarray) -> list[JsonValue]:
+def _replace_nan(values: np.ndarray) -> list[JsonValue]:
     return [value if np.isfinite(value) else None for value in values.tolist()]
 
 
@@ -288,7 +288,7 @@ def solve_window(
             "check the medium's index, the step's height and the window's described distance, and that the images are "
             "not rotated or mirrored"
         )
-    own = zip(steps, scanned[usable].T - true[:, None], strict=True)
+    pairs = zip(steps, scanned[usable].T - true[:, None], strict=True)
     squares, freedom = float(slopes @ slopes), len(steps) - 1
     std = float(np.sqrt(errors @ errors / freedom / squares)) if freedom else None
     scatter_std = float(np.linalg.norm(slopes * height_std)) / squares
@@ -311,7 +311,7 @@ def solve_window(
             scatter_std if std is None else std, per_height * height_std_mm, per_index * index_std
         ),
         image_distances_mm=np.array(
-            [_solve_single_distance(calibration, window, step, tried[usable], scan, distance) for step, scan in own]
+            [_solve_single_distance(calibration, window, step, tried[usable], scan, distance) for step, scan in pairs]
         ),
         curve_mm=np.column_stack([tried, mean_error]),
         bounds_mm=(low, high),

@@ -143,8 +143,8 @@ def _xml(text: str, path: Path) -> dict[str, object]:
         if depth > MOST_DEPTH:
             raise DescriptionError(f"{path} nests its elements more than {MOST_DEPTH} deep")
         if len(element) == 0:
-            words = [word.strip('"') for word in (element.text or "").split()]
-            return words[0] if len(words) == 1 else words
+            parts = [word.strip('"') for word in (element.text or "").split()]
+            return parts[0] if len(parts) == 1 else parts
         inside = [(child.tag, value(child, depth + 1)) for child in element]
         return [each for _, each in inside] if all(tag == "_" for tag, _ in inside) else dict(inside)
 
@@ -199,7 +199,7 @@ def _is_equidistant(entries: dict[str, object], path: Path) -> bool:
     Raises DescriptionError if one states a lens model that the sensor does not have.
     """
     stated: dict[bool, str] = {}
-    for key, value in _named_values(entries):
+    for key, value in _list_values(entries):
         name, model, entry = _plain_name(key), _plain_name(value), f"{key}: {shorten(str(value))}"
         foreign = model not in (*_BROWN_CONRADY, *_PINHOLES, *_EQUIDISTANT)
         equidistant = name in (*_MODELS, *_MAYBE_MODELS) and model in _EQUIDISTANT
@@ -226,14 +226,14 @@ def _is_equidistant(entries: dict[str, object], path: Path) -> bool:
     return True in stated
 
 
-def _named_values(value: object) -> Iterator[tuple[str, object]]:
+def _list_values(value: object) -> Iterator[tuple[str, object]]:
     """Yield the names and values of all tables, outer ones first; tables and lists of tables are searched."""
     if isinstance(value, dict):
         yield from ((str(key), each) for key, each in value.items() if not isinstance(each, dict | list))
     inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
     for each in inner:
         if isinstance(each, dict | list):
-            yield from _named_values(each)
+            yield from _list_values(each)
 
 
 def _unpack_kalibr(known: dict[str, object], path: Path) -> dict[str, object]:

@@ -263,7 +263,7 @@ def _import_folder(
                     content.add_line(row.profile, row.file)
                     image, encoder = row.profile, None if math.isnan(row.encoder) else row.encoder
                 else:
-                    image = _stored_image(row, reader, content, zero_dn=zero, saturation_dn=header.saturation_dn)
+                    image = _store_image(row, reader, content, zero_dn=zero, saturation_dn=header.saturation_dn)
                     image = image.astype(dtype, copy=False)
                 writer.append(Frame(image, row.stage_mm, row.light == "laser", exposure_ms, time_s, row.pose, encoder))
                 progress(number + 1, len(frames))
@@ -283,7 +283,7 @@ def _import_folder(
     return Imported(len(matched.laser), len(matched.lamp), tuple(warnings))
 
 
-def _stored_image(
+def _store_image(
     row: ImageRow, reader: "_Reader", content: _Content, *, zero_dn: int, saturation_dn: int
 ) -> np.ndarray:
     """Read an image and add it to the ``content``; return it without its background, if one is subtracted."""

@@ -47,7 +47,7 @@ class StageMotion(Description):
     direction: Vector | None = None
 
     @model_validator(mode="after")
-    def _exclusive_positions(self) -> "StageMotion":
+    def _check_exclusive(self) -> "StageMotion":
         if (self.start_mm is None) != (self.step_mm is None):
             raise ValueError("start_mm and step_mm belong together: give both, or positions_mm")
         given = [self.start_mm is not None, self.positions_mm is not None, self.free]
@@ -109,7 +109,7 @@ class ImportDescription(Description):
     provenance: Table | None = None
 
     @model_validator(mode="after")
-    def _given_once(self) -> "ImportDescription":
+    def _check_given_once(self) -> "ImportDescription":
         missing = [name for name in ("sensor", "medium") if getattr(self, name) is None]
         if self.header is None and missing:
             raise ValueError(f"{' and '.join(missing)} missing: a capture states its sensor and its medium")

@@ -109,7 +109,7 @@ def find_blobs(image, noise):
     for bright, mask in _local_masks(image, noise):
         blobs = _select_ellipses(mask, bright=bright, fewest=best_score[0])
         radii = blobs.radii
-        first, last = _largest_family(radii, 2.0)
+        first, last = _find_family(radii, 2.0)
         score = last - first, -float(np.median(radii)) if len(radii) else 0.0
         if score > best_score:
             best, best_score = blobs, score
@@ -119,7 +119,7 @@ def find_blobs(image, noise):
         blobs = _select_ellipses(mask, bright=bright)
         blobs = blobs[np.argsort(blobs.radii)]
         while len(blobs) >= _Rule.fewest:
-            first, last = _largest_family(blobs.radii, _Rule.size_range)
+            first, last = _find_family(blobs.radii, _Rule.size_range)
             families.append(blobs[first:last])
             blobs = blobs[np.delete(np.arange(len(blobs)), slice(first, last))]
     yield from sorted(families, key=len, reverse=True)[: _Rule.most_families]
@@ -287,7 +287,7 @@ def _outline_moments(points, first):
     return area, points[first] + np.stack([mu / unit, mv / unit], axis=1), covariances
 
 
-def _largest_family(radii, ratio):
+def _find_family(radii, ratio):
     """Return the first and the last place, plus one, among sorted radii of most radii within a ratio of each other."""
     ordered = np.sort(np.log(radii))
     ends = np.searchsorted(ordered, ordered + np.log(ratio), side="right")

@@ -114,9 +114,9 @@ def has_more_corners(grey: np.ndarray, board: np.ndarray) -> bool:
         inside = np.all((next_row > 0) & (next_row < np.array(grey.shape[::-1]) - 1), axis=2)[0]
         further = _compare_squares(grey, np.concatenate([next_row, turned]))[1][0]
         continues[turn] = inside.sum() > 2 and (further[inside] > usual / 2).mean() > 0.5
-        if continues[turn] and _are_whole(grey, next_row[0], turned[0]):
+        if continues[turn] and _check_whole(grey, next_row[0], turned[0]):
             return True
-        ends[turn] = inside.mean() > 0.5 and not continues[turn] and not _are_whole(grey, turned[0], turned[1])
+        ends[turn] = inside.mean() > 0.5 and not continues[turn] and not _check_whole(grey, turned[0], turned[1])
     return bool(continues.any() and ends.any())
 
 
@@ -132,7 +132,7 @@ def _extrapolate_row(rows: np.ndarray) -> np.ndarray:
     return rows[0] + (1.0 + ratio) / (3.0 - ratio) * (rows[0] - rows[1])
 
 
-def _are_whole(grey: np.ndarray, corners: np.ndarray, before: np.ndarray) -> bool:
+def _check_whole(grey: np.ndarray, corners: np.ndarray, before: np.ndarray) -> bool:
     """Return True if the squares beyond a row of corners (K, 2) alternate over their whole width."""
     near, far = (
         _measure_alternation(grey, corners + reach * (corners - before)) for reach in (_Rule.reaches[-1], _Rule.far)
@@ -210,9 +210,9 @@ def _compare_squares(grey: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np
         here[:, known] = sample_levels(grey, np.concatenate(places)).reshape(4, -1)
         difference = np.abs(here[0] + here[2] - here[1] - here[3]) / 2
         unlike = np.maximum(np.abs(here[0] - here[2]), np.abs(here[1] - here[3]))
-        alike = (contrast == 0) & (unlike < _Rule.unlike * difference)
-        levels = np.where(alike | (reach == _Rule.reaches[0]), here, levels)
-        contrast, reaches = np.where(alike, difference, contrast), np.where(alike, reach, reaches)
+        matching = (contrast == 0) & (unlike < _Rule.unlike * difference)
+        levels = np.where(matching | (reach == _Rule.reaches[0]), here, levels)
+        contrast, reaches = np.where(matching, difference, contrast), np.where(matching, reach, reaches)
     return levels, contrast, reaches
 
 

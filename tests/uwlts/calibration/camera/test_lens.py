@@ -128,8 +128,8 @@ def test_halves_are_doubted_beyond_four_standard_deviations_of_their_difference(
     # Halves of N independent measurements, with deviations s sqrt(2 / N) each, differ by s 2 / sqrt(N).
     values = np.random.default_rng(0).standard_normal((20_000, 16)) * 3.0
     deviation = np.std(values[:, ::2].mean(axis=1) - values[:, 1::2].mean(axis=1))
-    assert half_doubt("f", apart=3.9 * deviation, std=3.0 / 4) == []
-    (doubt,) = half_doubt("f", apart=4.1 * deviation, std=3.0 / 4)
+    assert half_doubt("f", difference=3.9 * deviation, std=3.0 / 4) == []
+    (doubt,) = half_doubt("f", difference=4.1 * deviation, std=3.0 / 4)
     assert "by 4.1 standard uncertainties" in doubt
 
 
