@@ -339,8 +339,8 @@ def _make_inspection(
     notes: Sequence[str] = (),
 ) -> Inspection:
     deviation = np.full(len(cloud), np.nan)
-    for scan, face in faces:
-        deviation[scan] = face.residuals_mm
+    for members, face in faces:
+        deviation[members] = face.residuals_mm
     if cloud.uncertainty is None:
         notes = WITHOUT_UNCERTAINTY, *notes
     return Inspection(kind, features, deviation, np.full(len(cloud), np.nan), tuple(notes)).consider_cloud(cloud)

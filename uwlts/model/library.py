@@ -345,14 +345,14 @@ def _check_places(inherited: _Inherited, sensor: Sensor) -> Iterator[str]:
             f"set it to the apparent distance in mm of the stand-off ({places}), and f_number ({camera.f_number:g})"
         )
         yield from inherited.say("camera.focus_distance_mm", [*_PLACEMENT, *_LENS, *window, *media], misfit, advice)
-    distances_ = float(np.linalg.norm(laser_pose(sensor).origin_mm - (0.0, 0.0, standoff)))
+    to_standoff = float(np.linalg.norm(laser_pose(sensor).origin_mm - (0.0, 0.0, standoff)))
     index = max(indices.values(), default=1.0)
     rayleigh = math.pi * laser.waist_radius_mm**2 * index / (laser.beam_quality_m2 * 1e-6 * laser.wavelength_nm)
-    thicker = math.hypot(1.0, (distances_ - laser.waist_distance_mm) / rayleigh)
+    thicker = math.hypot(1.0, (to_standoff - laser.waist_distance_mm) / rayleigh)
     if thicker > _THICKER:
         misfit = f"; at the stand-off the sheet is {thicker:.2f} times as thick as in its waist"
         depends_on = [*_PLACEMENT, _WAVELENGTH, "laser.waist_radius_mm", "laser.beam_quality_m2", *media]
-        advice = f"set it to the laser's distance from the stand-off, {distances_:.1f}"
+        advice = f"set it to the laser's distance from the stand-off, {to_standoff:.1f}"
         yield from inherited.say("laser.waist_distance_mm", depends_on, misfit, advice)
     outside = standoff - camera.window.distance_mm - camera.window.thickness_mm
     if not volume.near_mm <= outside <= volume.far_mm:

@@ -348,10 +348,10 @@ def describe_wrong_sizes(deviations: Sequence[SizeDeviation], *, least: float = 
         return []
     share, std = np.array([(each.off_mm, each.off_std_mm) for each in known]).T / [each.described_mm for each in known]
     common = float(np.sum(share / std**2) / np.sum(1 / std**2))
-    text = _shorten_list(each.words() for each in far)
+    texts = _shorten_list(each.words() for each in far)
     if len(known) > 1 and np.all(np.abs(share - common) < _ALIKE * std):
-        text.append(f"all known sizes are off by the same {100 * common:+.2f} %: also check the target's spacings")
-    return text
+        texts.append(f"all known sizes are off by the same {100 * common:+.2f} %: also check the target's spacings")
+    return texts
 
 
 def _check_earlier(result: Estimate) -> _Found:

@@ -199,20 +199,20 @@ def _judge_form(problem: JointProblem, seen: PriorDeviations, near: Estimate) ->
     form, known = seen.form(), problem.parameters
     scaled = {key: replace(prior, std=seen.birge_ratio * prior.std) for key, prior in known.priors.items()}
     priors, off = dict(scaled), {each.key: abs(each.alone - each.known) for each in seen.of_target()}
-    for likely in (BENDS, STRETCH):
-        if any(each.key in likely for each in form):
-            together = sum(off.get(key, 0.0) for key in likely)
-            priors |= {key: replace(priors[key], std=max(priors[key].std, together)) for key in likely}
+    for group in (BENDS, STRETCH):
+        if any(each.key in group for each in form):
+            together = sum(off.get(key, 0.0) for key in group)
+            priors |= {key: replace(priors[key], std=max(priors[key].std, together)) for key in group}
     wider = replace(known, priors=priors)
     halves = _compare_halves_of_form(replace(problem, parameters=wider), near) if form else []
     times = {each: priors[each.key].std / scaled[each.key].std for each in form}
     refused = {each: many for each, many in times.items() if many > _MOST_WIDENED or halves is None}
     tied = {}
-    for likely in (BENDS, STRETCH):
-        if any(each.key in likely for each in (*(halves or ()), *refused)):
+    for group in (BENDS, STRETCH):
+        if any(each.key in group for each in (*(halves or ()), *refused)):
             # The stated uncertainty is multiplied by the deviation's ratio to it (Birge's ratio of one value).
-            less_sure = max((each.sigmas for each in form if each.key in likely), default=1.0)
-            tied |= {key: less_sure for key in likely if key in known.keys}
+            less_sure = max((each.sigmas for each in form if each.key in group), default=1.0)
+            tied |= {key: less_sure for key in group if key in known.keys}
     if tied:
         stated = {key: replace(scaled[key], std=less_sure * scaled[key].std) for key, less_sure in tied.items()}
         wider = replace(known, priors=priors | stated, tied=frozenset(tied))
@@ -251,10 +251,10 @@ class _Attempt:
     said: tuple[str, ...]
 
     @classmethod
-    def solve(cls, gathered: Gathered, options: CalibrationOptions, text: tuple[str, ...] = ()) -> Self:
+    def solve(cls, gathered: Gathered, options: CalibrationOptions, texts: tuple[str, ...] = ()) -> Self:
         """Solve the problem for this evidence and these options."""
         problem = joint_problem(gathered, options=options)
-        return cls(gathered, options, problem, *solve_and_check(problem), text)
+        return cls(gathered, options, problem, *solve_and_check(problem), texts)
 
     def improve(self) -> "_Attempt":
         """Change the problem by all rules in turn; contradictions of the description remain."""
