@@ -161,7 +161,7 @@ def fit_signal_response(depth_mm: np.ndarray, signal_mm: np.ndarray, *, threshol
     offset, slope, scatter = best[0], best[1], math.exp(best[2])
     ninety, steps = float(stats.norm.ppf(_NINETY)) * scatter, np.array([0.1 * scatter, 0.02 * slope, 0.02])
     a90, bound = (threshold_mm - offset + ninety) / slope, None
-    covariance = np.linalg.pinv(_second_differences(loss, best, steps)) * np.outer(steps, steps)
+    covariance = np.linalg.pinv(_differentiate_twice(loss, best, steps)) * np.outer(steps, steps)
     # Uncensored signals give N - 2, as n - 2 values with a known variance of the logarithm of their scatter would.
     freedom = 0.5 / covariance[2, 2] - 2
 

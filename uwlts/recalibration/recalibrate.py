@@ -475,10 +475,10 @@ def _add_mount(
 
     A mount that was estimated with the same calibration has a part of its errors in common with it.
     """
-    apart, common = mount.independent_covariance(calibration_digest(prior))
-    of_mount = CovarianceRoot.from_covariance(apart).root
+    independent, common = mount.independent_covariance(calibration_digest(prior))
+    of_mount = CovarianceRoot.from_covariance(independent).root
     by_mount, alone = mount.clock_errors(of_mount)
-    own = np.block([[of_mount, np.zeros((6, 1))], [by_mount, np.array(alone)]])
+    mount_root = np.block([[of_mount, np.zeros((6, 1))], [by_mount, np.array(alone)]])
     by = np.zeros((7, root.shape[1]))
     if common is not None:
         by[:6] = common @ root[: common.shape[1]]

@@ -94,7 +94,7 @@ def _characteristic_row(each: Characteristic) -> tuple[str, ...]:
     expanded = MISSING if worst is None or worst.expanded_mm is None else format_fixed(worst.expanded_mm, 4)
     place = MISSING if worst is None else f"{worst.position}, {worst.label}"
     limit, chance = each.limit_text() or MISSING, each.probability_text() or MISSING
-    name = f"{words}; {guideline}"
+    name = f"{text}; {guideline}"
     return each.symbol, each.decision_text(), value, expanded, limit, chance, place, f"{each.count}", name
 
 

@@ -298,7 +298,9 @@ def _page(
         maps=_make_maps(found, cloud, parts, order),
         accuracy=_point_accuracy(cloud),
         depths=[format_to_scale(each, each, digits=2) for each in dict.fromkeys((*depths[:1], *depths[-1:]))],
-        pictures=[(each.title, judge_feature(each, order.limits)[0], _picture(each, found, cloud)) for each in drawn],
+        pictures=[
+            (each.title, judge_feature(each, order.limits)[0], _plot_finding(each, found, cloud)) for each in drawn
+        ],
         left_out=len(parts) - len(drawn),
         notes=found.notes,
         checks=[(artefact, list(map(_check_row, figures))) for artefact, figures in checks],
