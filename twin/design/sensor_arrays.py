@@ -186,16 +186,6 @@ class SensorArrays:
         distance, thickness = self.laser_window_distance_mm, self.laser_window_thickness_mm
         return WindowGeometry(axis, distance, thickness, self.laser_window_index, self.medium_index)
 
-    def window_passes(self, xp: ModuleType) -> Array:
-        """Return the transmittance of the camera's window (faces, and Beer-Lambert law)."""
-        return self.window_faces_pass * xp.exp(-self.window_absorption_per_mm * self.window_thickness_mm)
-
-    def laser_window_passes(self, xp: ModuleType) -> Array:
-        """Return the transmittance of the laser's window."""
-        return self.laser_window_faces_pass * xp.exp(
-            -self.laser_window_absorption_per_mm * self.laser_window_thickness_mm
-        )
-
     def pixel_contrast(self, xp: ModuleType) -> Array:
         """Return the speckle contrast of a pixel, averaged over its area and two incoherent polarisations."""
         return self._evaluate_grain_average(xp, _pixel_series()) * self.speckle_coherence / math.sqrt(2)

@@ -83,11 +83,6 @@ class Light:
         light = self.sheet.evaluate(self._to_own @ mi.Point3f(p))
         return replace(light, direction=self._from_own @ light.direction, normal=self._from_own @ light.normal)
 
-    @property
-    def mirrored(self) -> bool:
-        """True if the light is reflected by a mirror."""
-        return self.mirror is not None
-
     def may_reach(self, p: Point3f, light: SheetLight) -> Bool | None:
         """Return the mask of points that the mirror can illuminate; None for a direct light, which has no limit."""
         return None if self.mirror is None else self._intersect_mirror(p, -light.direction)[1]

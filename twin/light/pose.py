@@ -53,10 +53,6 @@ class Travel:
         half = self.exposure_s / 2
         return min(at_edges) - half, max(at_edges) + half
 
-    def fastest_mm_s(self, reach_mm: float) -> float:
-        """Return the largest speed in mm/s of points within ``reach_mm`` of the OCS's origin."""
-        return float(np.linalg.norm(self.velocity_mm_s) + np.linalg.norm(self.turn_rad_s) * reach_mm)
-
 
 class SensorPose:
     """Pose of the sensor's OCS in the scene, stored opaquely so that a new pose does not recompile kernels."""

@@ -15,14 +15,14 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Literal
+from typing import Any, Literal, cast
 
 import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.backend.arrays import Float, Point3f, UInt32, Vector4f, begin_kernels, opaque, to_jit
+from twin.backend.arrays import Float, UInt32, Vector4f, begin_kernels, opaque, to_jit
 from twin.light.camera import CameraView, RaySegment, trace_segments
 from twin.light.illumination import (
     CELLS,
@@ -196,7 +196,8 @@ class Renderer:
             return np.zeros(self._size, np.float32)
         pose, ambient, pattern = SensorPose(scene_from_object, travel), light == "day", None
         if self._caustics is not None and ambient:
-            pattern = to_jit(self._caustics.pattern(time_s, exposure_s))
+            drawn = mi.TensorXf(self._caustics.pattern(time_s, exposure_s)[..., None])
+            pattern = cast(Any, mi).Texture2f(drawn, use_accel=False, wrap_mode=dr.WrapMode.Repeat)
         begin_kernels()
         bundle, shape = self.view.trace_grid(1)
         segment = next(self._segments(pose, bundle, None))
@@ -423,7 +424,8 @@ class Renderer:
         yield pose, sources
         if pose.travel is not None:
             first, last = pose.travel.time_range(self.sensor.camera.height_px)
-            way_mm = (last - first) * pose.travel.fastest_mm_s(_REACH_SHARE * self.design.standoff_mm)
+            turning = np.linalg.norm(pose.travel.turn_rad_s) * _REACH_SHARE * self.design.standoff_mm
+            way_mm = (last - first) * (np.linalg.norm(pose.travel.velocity_mm_s) + turning)
             for after_s in np.linspace(first, last, 2 + int(way_mm / _TRAVEL_STEP_MM)):
                 moved = pose.displace(float(after_s))
                 direct, mirrored = make_lights(self._sheets, moved, self._mirrors)
@@ -454,11 +456,12 @@ class Renderer:
 
     # --- lamp ---------------------------------------------------------------------------------------------------------
 
-    def _compute_even_light(self, segment: RaySegment, ambient: bool, pattern: Float | None) -> Float:
+    def _compute_even_light(self, segment: RaySegment, ambient: bool, pattern: Any) -> Float:
         """Return the irradiance per ray in W/mm2 for evenly lit surfaces, seen through the water and its veiling light.
 
-        A surface of albedo A at the irradiance E has the radiance A E / pi. Daylight is isotropic, so the water
-        scatters the radiance E / pi into every ray. The lamp is beside the camera, so only backscattered light returns.
+        A surface of albedo A at the irradiance E has the radiance A E / pi. Daylight comes evenly from the half-space
+        of the sensor, -Z: a surface tilted by the angle a gets (1 + cos a) / 2 of E. The water scatters the radiance
+        E / pi into every ray. The lamp is beside the camera, so only backscattered light returns.
         Up to the distance t, the veiling light is E / pi (1 - exp(-c t)) times the scattered fraction of the extinction
         c (Duntley 1963, Eq. 4, for an even light field). ``pattern`` is that of focused daylight on surfaces.
         """
@@ -466,28 +469,18 @@ class Renderer:
         level = opaque(1e-6 / math.pi * (lamp.ambient_w_per_m2 if ambient else lamp.irradiance_w_per_m2))
         left = dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, dr.inf))
         albedo = self.objects.albedo(segment.si) if ambient else self.objects.lamp_albedo(segment.si)
+        albedo *= 0.5 - 0.5 * dr.mulsign(segment.si.n.z, segment.si.wi.z) if ambient else 1.0
         radiance = dr.select(segment.valid, albedo * left, 0.0)
         if pattern is not None:
-            radiance *= self._caustic(segment.si.p, pattern)
+            # Texels are at half cells, the pattern's nodes at whole ones.
+            place = mi.Point2f(segment.si.p.x, segment.si.p.y) / PATCH_MM + 0.5 / CELLS
+            radiance *= pattern.eval(place)[0]
         if self.effects.haze and self.scattering.coefficient > 0:
             scattered = self.scattering.coefficient * (1 if ambient else self.scattering.backward_share)
             radiance += opaque(scattered / self.scattering.extinction) * (1 - left)
         if self._flaws.uneven_lamp and not ambient:
             radiance *= self._lamp_share(segment)
         return segment.weight * level * radiance
-
-    def _caustic(self, p: Point3f, pattern: Float) -> Float:
-        """Return the relative daylight at points of the scene: the pattern at X and Y, interpolated linearly."""
-        x, y = p.x * (CELLS / PATCH_MM), p.y * (CELLS / PATCH_MM)
-        left, top = dr.floor(x), dr.floor(y)
-
-        def read(beside: int, below: int) -> Float:
-            column, row = mi.Int32(left) + beside, mi.Int32(top) + below
-            # The number of cells is a power of two, so that the bits below it count periodically.
-            return dr.gather(mi.Float, pattern, mi.UInt32((row & (CELLS - 1)) * CELLS + (column & (CELLS - 1))))
-
-        above, below = (dr.lerp(read(0, row), read(1, row), x - left) for row in (0, 1))
-        return dr.lerp(above, below, y - top)
 
     def _lamp_share(self, segment: RaySegment) -> Float:
         """Return the fraction of lamp light at the end of camera rays: a round Gaussian spot about the lamp's axis.
