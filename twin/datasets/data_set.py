@@ -88,51 +88,29 @@ class OneOf(Description):
 
     def quantile(self, share: float) -> Value:
         """Return the value at a cumulative probability."""
-        weights = self.weights or (1.0,) * len(self.values)
-        left = share * math.fsum(weights)
-        for value, weight in zip(self.values, weights, strict=True):
-            if left < weight:
-                return value
-            left -= weight
-        return self.values[-1]
+        below = np.cumsum(self.weights or (1.0,) * len(self.values))
+        return self.values[min(int(np.searchsorted(below, share * below[-1], "right")), len(self.values) - 1)]
 
 
-class Between(Description):
-    """Base of distributions on a range."""
+class Uniform(Description):
+    """Uniform distribution on a range, of the value or, for "log_uniform", of its logarithm."""
 
+    kind: Literal["uniform", "log_uniform"]
     least: float
     most: float
 
     @model_validator(mode="after")
-    def _check_order(self) -> Self:
+    def _check_range(self) -> Self:
         if not self.least < self.most:
             raise ValueError(f"least {self.least:g} must be smaller than most {self.most:g}")
-        return self
-
-
-class Uniform(Between):
-    """Uniform distribution on a range."""
-
-    kind: Literal["uniform"]
-
-    def quantile(self, share: float) -> float:
-        """Return the quantile of a probability."""
-        return self.least + share * (self.most - self.least)
-
-
-class LogUniform(Between):
-    """Log-uniform distribution on a range: the logarithm is uniform."""
-
-    kind: Literal["log_uniform"]
-
-    @model_validator(mode="after")
-    def _check_positive(self) -> Self:
-        if self.least <= 0:
+        if self.kind == "log_uniform" and self.least <= 0:
             raise ValueError(f"least of a log_uniform distribution is {self.least:g}; it must be above 0")
         return self
 
     def quantile(self, share: float) -> float:
         """Return the quantile of a probability."""
+        if self.kind == "uniform":
+            return self.least + share * (self.most - self.least)
         return self.least * (self.most / self.least) ** share
 
 
@@ -161,14 +139,11 @@ class Normal(Description):
         return float(self.mean + self.std * ndtri(low + share * (high - low)))
 
     def _ends(self) -> tuple[float, float]:
-        low, high = (
-            default if end is None else float(ndtr((end - self.mean) / self.std))
-            for end, default in ((self.least, 0.0), (self.most, 1.0))
-        )
-        return low, high
+        low = 0.0 if self.least is None else float(ndtr((self.least - self.mean) / self.std))
+        return low, 1.0 if self.most is None else float(ndtr((self.most - self.mean) / self.std))
 
 
-AnyDistribution = Annotated[Constant | OneOf | Uniform | LogUniform | Normal, Field(discriminator="kind")]
+AnyDistribution = Annotated[Constant | OneOf | Uniform | Normal, Field(discriminator="kind")]
 
 
 class Splits(Description):
@@ -273,10 +248,6 @@ class DataSetDescription(Description):
         self._whole = frozenset(whole)
         return self
 
-    def frames_per_scene(self) -> int:
-        """Return the number of images of each scene."""
-        return self.scene.motion.images()
-
     def options(self, *, seed: int, strengths: dict[str, Value] | None = None) -> Options:
         """Return the options for rendering a scene; ``strengths`` are the drawn strengths of effects by name."""
         drawn = [f"{name}={value}" for name, value in (strengths or {}).items()]
@@ -285,6 +256,8 @@ class DataSetDescription(Description):
     def draw_value(self, path: str, share: float) -> Value:
         """Return the quantile of a path's distribution at a probability from 0 to 1, rounded for integers."""
         value = self.vary[path].quantile(share)
+        if path.endswith((".path", ".texture")):  # from the folder of the scene, as in its file
+            return str(Path(str(self._base_value(path))).parent / str(value))
         return round(value) if path in self._whole and not isinstance(value, str) else value
 
     def _base_value(self, path: str) -> Value | None:

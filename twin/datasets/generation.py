@@ -58,7 +58,8 @@ if TYPE_CHECKING:
 Described = TypeVar("Described", Sensor, Scene)
 
 _BRIGHT = 0.03
-"""Largest fraction of pixels at the maximum without a warning; a stripe of 20 px with all its pixels there has 2 %."""
+"""Largest fraction of pixels above `auto_level` by automatic exposure, and at the maximum without a warning: a stripe
+of 20 px with all its pixels there has 2 to 4 %."""
 
 
 def write_card(
@@ -68,7 +69,7 @@ def write_card(
 
     ``shards`` are path, split and number of frames of the complete shards.
     """
-    per_scene, versions = description.frames_per_scene(), plan["versions"]
+    per_scene, versions = description.scene.motion.images(), plan["versions"]
     frames: dict[Split, int] = {split: sum(count for _, part, count in shards if part == split) for split in SPLITS}
     card = DataCard(
         title=description.title,
@@ -317,7 +318,7 @@ class _Job:
 
     @property
     def frames(self) -> int:
-        return len(self.scenes) * self.description.frames_per_scene()
+        return len(self.scenes) * self.description.scene.motion.images()
 
 
 def _jobs(description: DataSetDescription, folder: Path, variant: str) -> list[_Job]:
@@ -357,7 +358,7 @@ def _render_shard(job: _Job, report: Callable[[None], None]) -> None:
         for scene in job.scenes:
             drawn, simulator = _draw_measurable(job.description, scene)
             for index, shot in enumerate(drawn.scene.motion.shots()):
-                taken = simulator.expose(shot, index, exposure=drawn.exposures[index])
+                taken = simulator.expose(shot, index, exposure=drawn.exposures[index], bright_share=_BRIGHT)
                 arrays = make_labels(simulator, shot, taken, job.description.labels)
                 info = _make_frame_metadata(job.description, drawn, simulator, shot, taken, index)
                 writer.add(Sample(f"{scene:06d}-{index:02d}", taken.image, arrays, info))

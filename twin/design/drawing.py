@@ -24,24 +24,14 @@ from uwlts.pages.toolkit import BLUE, INK, RED, SOFT, new_figure
 _BEYOND = 1.06  # length of drawn rays and sheet relative to the distance of the volume's far end
 _DEPTHS = 201  # depths at which the region that both camera and laser reach is searched
 _PLACES = 21  # points along the stripe at each depth
-# The description does not contain the housing: these sizes only indicate it.
-_HOUSING_MM = 42.0
-_WALL_MM = 5.0
-_BARE_FRONT_MM = 12.0
-"""Distance of the housing's front from the pupil without a window."""
-_BARE_HALF_MM = 15.0  # half the width of the front without a window
 
 
 @dataclass(frozen=True, eq=False)
 class Module:
-    """Camera or laser in a view, in mm: origin (2,), corners of the window, (4, 2) or (0, 2), and housing (5, 2).
-
-    Origin and window are to scale. The housing is only indicated, because the description does not contain it.
-    """
+    """Camera or laser in a view, in mm: origin (2,), and corners of the window, (4, 2) or (0, 2)."""
 
     origin: np.ndarray
     window: np.ndarray
-    housing: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +54,8 @@ class SideView:
 
     def outlines(self) -> list[np.ndarray]:
         """Return lines (K, 2) for drawing the design behind another one; they enclose the whole view."""
-        return [*self.edges, self.sheet, self.camera.housing, self.laser.housing, self.volume]
+        modules = [points for module in (self.camera, self.laser) for points in (module.origin[None], module.window)]
+        return [*self.edges, self.sheet, *modules, self.volume]
 
 
 def make_view(sensor: Sensor, medium: Medium) -> SideView:
@@ -136,21 +127,13 @@ def _project(
     origin: np.ndarray, axis: np.ndarray, described: Window, window: WindowGeometry | None, view: np.ndarray
 ) -> Module:
     """Project a module in the camera frame, with its window as described and as mounted, onto the axes (2, 3)."""
-    forward = view @ axis / np.linalg.norm(view @ axis)
-    sideways = np.array([forward[1], -forward[0]])
-    place = view @ origin
-    front, half, corners = _BARE_FRONT_MM, _BARE_HALF_MM, np.empty((0, 2))
-    if window is not None:
-        normal = np.array(window.normal)
-        seen = view @ normal
-        half, front = described.aperture_diameter_mm / 2, described.distance_mm
-        along = half * (np.array([seen[1], -seen[0]]) / np.linalg.norm(seen))
-        inner = origin + front * axis
-        inner, outer = (view @ face for face in (inner, inner + window.thickness_mm * normal))
-        corners = np.array([inner - along, inner + along, outer + along, outer - along])
-    side = (half + _WALL_MM) * sideways
-    head, rear = place + front * forward, place - _HOUSING_MM * forward
-    return Module(place, corners, np.array([rear - side, rear + side, head + side, head - side, rear - side]))
+    if window is None:
+        return Module(view @ origin, np.empty((0, 2)))
+    normal = np.array(window.normal)
+    inner = origin + described.distance_mm * axis
+    inner, outer, seen = (view @ each for each in (inner, inner + window.thickness_mm * normal, normal))
+    along = described.aperture_diameter_mm / 2 * np.array([seen[1], -seen[0]]) / np.linalg.norm(seen)
+    return Module(view @ origin, np.array([inner - along, inner + along, outer + along, outer - along]))
 
 
 def _border_towards(camera: Camera, across: np.ndarray) -> np.ndarray:
@@ -167,8 +150,6 @@ def _border_towards(camera: Camera, across: np.ndarray) -> np.ndarray:
 
 _GLASS = "#12a3a8"
 _BEHIND = "#98a3af"
-_THIN = "#b9c2cc"
-_HOUSING = "#aab4c0"
 _VOLUME = "#f1ecd9"
 _VOLUME_END = "#bda96b"
 _INCHES = (7.5, 7.0)  # width and height
@@ -192,16 +173,10 @@ def draw(view: SideView, other: SideView | None = None) -> Figure:
     return figure
 
 
-def _fill(axes: Axes, points: np.ndarray, colour: str, alpha: float, edge: str = "none") -> None:
+def _fill(axes: Axes, points: np.ndarray, colour: str, alpha: float) -> None:
     """Fill an outline (N, 2) if all its points are finite."""
     if len(points) and np.isfinite(points).all():
-        axes.fill(*points.T, facecolor=colour, edgecolor=edge, alpha=alpha, linewidth=0.8)
-
-
-def _draw_module(axes: Axes, module: Module, name: str) -> None:
-    _fill(axes, module.housing, _HOUSING, 0.3, edge=_HOUSING)
-    _fill(axes, module.window, _GLASS, 0.4, edge=_GLASS)
-    axes.annotate(name, module.housing[:2].mean(axis=0), xytext=(0, 6), textcoords="offset points", ha="center")
+        axes.fill(*points.T, facecolor=colour, alpha=alpha)
 
 
 def _dimension(axes: Axes, start: tuple[float, float], end: tuple[float, float], text: str) -> None:
@@ -221,8 +196,9 @@ def _draw_side(axes: Axes, view: SideView, *, labels_at: float) -> None:
         axes.axhline(depth, color=_VOLUME_END, linewidth=0.8, zorder=0)
         axes.text(labels_at, depth, f"{name} {number_text(depth - outer)} mm", va="bottom")
     _fill(axes, np.concatenate([view.edges[0], view.edges[1][::-1]]), BLUE, 0.1)
-    _draw_module(axes, view.camera, "camera")
-    _draw_module(axes, view.laser, "laser")
+    for module, name in ((view.camera, "camera"), (view.laser, "laser")):
+        _fill(axes, module.window, _GLASS, 0.4)
+        axes.text(module.origin[0], module.origin[1], name, ha="center", va="bottom")
     axes.axvline(0.0, color=SOFT, linewidth=0.8, linestyle="-.", zorder=1)
     for edge in view.edges:
         axes.plot(*edge.T, color=BLUE, linewidth=0.9)
@@ -246,5 +222,5 @@ def _draw_side(axes: Axes, view: SideView, *, labels_at: float) -> None:
     _dimension(axes, (0.0, 0.75 * top), (shown, 0.75 * top), text)
     _dimension(axes, (0.8 * left, outer), (0.8 * left, cross), f"stand-off {number_text(cross - outer)} mm")
     for depth in (outer, cross):
-        axes.plot([0.8 * left, 0.0], [depth, depth], color=_THIN, linewidth=0.6)
+        axes.plot([0.8 * left, 0.0], [depth, depth], color=_BEHIND, linewidth=0.6)
     axes.set(xlabel="across the stripe / mm", ylabel="depth from the pupil / mm")

@@ -116,14 +116,13 @@ def model_stripe(
     back = length_outside_mm(xp, window, view.path)
     way = length_outside_mm(xp, laser_window, fan) + back
     passed = xp.exp(-p.extinction_per_mm * way)
-    # Transmittance of both windows: their faces, and the Beer-Lambert law.
-    in_glass = p.laser_window_faces_pass * xp.exp(-p.laser_window_absorption_per_mm * p.laser_window_thickness_mm)
-    on_surface = per_mm / (math.sqrt(2 * math.pi) * sheet) * in_glass * passed
+    laser_glass = p.laser_window_faces_pass * xp.exp(-p.laser_window_absorption_per_mm * p.laser_window_thickness_mm)
+    on_surface = per_mm / (math.sqrt(2 * math.pi) * sheet) * laser_glass * passed
     a, b = view.slopes
     cosine_squared = 1 / (1 + a * a + b * b)
     lens = math.pi / 4 / (number * number) * cosine_squared * cosine_squared
-    in_glass = p.window_faces_pass * xp.exp(-p.window_absorption_per_mm * p.window_thickness_mm)
-    per_radiance = lens * in_glass / (p.medium_index * p.medium_index)
+    camera_glass = p.window_faces_pass * xp.exp(-p.window_absorption_per_mm * p.window_thickness_mm)
+    per_radiance = lens * camera_glass / (p.medium_index * p.medium_index)
     pixel_area = p.pixel_mm * p.pixel_mm / p.pixel_aspect
     electrons = 1e-3 * pixel_area * 1e-3 * p.wavelength_mm / PLANCK_TIMES_LIGHT * p.quantum_efficiency
     rate = on_surface * reflectance / math.pi * per_radiance * electrons * thick / sigma

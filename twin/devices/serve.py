@@ -9,7 +9,6 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import count
 from typing import TYPE_CHECKING
@@ -21,7 +20,7 @@ from twin.devices.grbl_controller import GrblController, StageState
 from twin.recording.render import AnyScene, choose_scene
 from twin.rendering_options import CPU, Options, Variant, use_variant
 from twin.scene.campaign import AnySensor, choose_sensors
-from twin.scene.description import Scene, replace_values
+from twin.scene.description import replace_values
 from twin.scene.platforms import Light, Motion, Shot
 from uwlts.errors import DescriptionError, DesignError
 from uwlts.model.sensor import Stage
@@ -283,16 +282,6 @@ class ServedTwin:
                 signal.signal(number, handler)
 
 
-def _require_stage(scene: Scene) -> Motion:
-    """Return the motion of a scene; DescriptionError if it is not one of the stage."""
-    if not isinstance(scene.motion, Motion):
-        raise DescriptionError(
-            f"{scene.title} moves on a {scene.motion.kind}; expected a scene with a motion of the stage"
-        )
-    return scene.motion
-
-
-@contextmanager
 def serve(
     scene: AnyScene,
     *,
@@ -368,7 +357,10 @@ def serve(
         raise DescriptionError("lamp-and-laser cannot be served, because the controller switches the laser: remove it")
     if not speed_up > 0:
         raise DescriptionError(f"speed_up is {speed_up:g}; it must be positive")
-    motion = _require_stage(described)
+    if not isinstance(motion := described.motion, Motion):
+        raise DescriptionError(
+            f"{described.title} moves on a {motion.kind}; expected a scene with a motion of the stage"
+        )
     _, built = choose_sensors(sensor, as_built)
     faults = [parse_fault(text) for text in fault]
     use_variant(variant)

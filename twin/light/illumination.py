@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import drjit as dr
@@ -83,11 +84,6 @@ class Light:
             return self.sheet.evaluate(p)
         light = self.sheet.evaluate(self._to_sheet @ mi.Point3f(p))
         return replace(light, direction=self._from_sheet @ light.direction, normal=self._from_sheet @ light.normal)
-
-    @property
-    def mirrored(self) -> bool:
-        """True if the light is reflected by a mirror."""
-        return self.mirror is not None
 
     def may_reach(self, p: Point3f, light: SheetLight) -> Bool | None:
         """Return the mask of points that the mirror can illuminate; None for a direct light, which has no limit."""
@@ -505,11 +501,12 @@ class EvenLight:
     haze: bool
     uneven_lamp: float
 
-    def irradiance(self, segment: RaySegment, ambient: bool, pattern: Float | None) -> Float:
+    def irradiance(self, segment: RaySegment, ambient: bool, pattern: Any) -> Float:
         """Return the irradiance per ray in W/mm2 for evenly lit surfaces, seen through the water and its veiling light.
 
-        A surface of albedo A at the irradiance E has the radiance A E / pi. Daylight is isotropic, so the water
-        scatters the radiance E / pi into every ray. The lamp is beside the camera, so only backscattered light returns.
+        A surface of albedo A at the irradiance E has the radiance A E / pi. Daylight comes evenly from the half-space
+        of the sensor, -Z: a surface tilted by the angle a gets (1 + cos a) / 2 of E. The water scatters the radiance
+        E / pi into every ray. The lamp is beside the camera, so only backscattered light returns.
         Up to the distance t, the veiling light is E / pi (1 - exp(-c t)) times the scattered fraction of the extinction
         c (Duntley 1963, Eq. 4, for an even light field). ``pattern`` is that of focused daylight on surfaces.
         """
@@ -517,9 +514,12 @@ class EvenLight:
         level = opaque(1e-6 / math.pi * (lamp.ambient_w_per_m2 if ambient else lamp.irradiance_w_per_m2))
         left = dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, dr.inf))
         albedo = self.objects.albedo(segment.si) if ambient else self.objects.lamp_albedo(segment.si)
+        albedo *= 0.5 - 0.5 * dr.mulsign(segment.si.n.z, segment.si.wi.z) if ambient else 1.0
         radiance = dr.select(segment.valid, albedo * left, 0.0)
         if pattern is not None:
-            radiance *= _read_pattern(segment.si.p, pattern)
+            # Texels are at half cells, the pattern's nodes at whole ones.
+            place = mi.Point2f(segment.si.p.x, segment.si.p.y) / PATCH_MM + 0.5 / CELLS
+            radiance *= pattern.eval(place)[0]
         if self.haze and self.scattering.coefficient > 0:
             scattered = self.scattering.coefficient * (1 if ambient else self.scattering.backward_share)
             radiance += opaque(scattered / self.scattering.extinction) * (1 - left)
@@ -537,17 +537,3 @@ class EvenLight:
         corner = self.sensor.camera.corner_slope()
         squared = dr.square(x / corner - _SPOT_ASIDE) + dr.square(y / corner)
         return dr.exp(math.log(1 - self.uneven_lamp) * squared)
-
-
-def _read_pattern(p: Point3f, pattern: Float) -> Float:
-    """Return the relative daylight at points of the scene: the pattern at X and Y, interpolated linearly."""
-    x, y = p.x * (CELLS / PATCH_MM), p.y * (CELLS / PATCH_MM)
-    left, top = dr.floor(x), dr.floor(y)
-
-    def read(beside: int, below: int) -> Float:
-        column, row = mi.Int32(left) + beside, mi.Int32(top) + below
-        # The number of cells is a power of two, so that the bits below it count periodically.
-        return dr.gather(mi.Float, pattern, mi.UInt32((row & (CELLS - 1)) * CELLS + (column & (CELLS - 1))))
-
-    above, below = (dr.lerp(read(0, row), read(1, row), x - left) for row in (0, 1))
-    return dr.lerp(above, below, y - top)

@@ -15,7 +15,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Literal
+from typing import Any, Literal, cast
 
 import cv2
 import drjit as dr
@@ -392,7 +392,8 @@ class Renderer:
             return np.zeros(self._size, np.float32)
         pose, ambient, pattern = SensorPose(scene_from_object, travel), light == "day", None
         if self._caustics is not None and ambient:
-            pattern = to_jit(self._caustics.pattern(time_s, exposure_s))
+            drawn = mi.TensorXf(self._caustics.pattern(time_s, exposure_s)[..., None])
+            pattern = cast(Any, mi).Texture2f(drawn, use_accel=False, wrap_mode=dr.WrapMode.Repeat)
         begin_kernels()
         bundle, shape = self.view.trace_grid(1)
         segment = next(self._surfaces.segments(pose, bundle, None))

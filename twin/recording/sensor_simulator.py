@@ -146,6 +146,7 @@ class SensorSimulator:
         self._pattern = None
         if options.effects.fixed_pattern:
             self._pattern = fixed_pattern(self.sensor.detector, height=camera.height_px, width=camera.width_px)
+        self._level_e = self.sensor.exposure.auto_level * self.sensor.detector.full_well_e
         self.exposure_ms = {light: self._exposure(light, probe) for light in dict.fromkeys(scene.motion.lights)}
         longest_ms = max(self.exposure_ms[shot.light] * shot.exposure for shot in scene.motion.shots())
         self.period_s = self._period_s(max(1e-3 * longest_ms, 1 / self.sensor.detector.frame_rate_hz))
@@ -325,15 +326,20 @@ class SensorSimulator:
         """Return the grey values (H, W) of a shot; noise depends only on seed, position and index."""
         return self._render_image(self.light(shot, index), shot, index)
 
-    def _render_image(self, light: ShotLight, shot: Shot, index: int, *, exposure: float = 1.0) -> np.ndarray:
-        exposure_ms = exposure * self._exposure_of(shot)
+    def _render_image(self, light: ShotLight, shot: Shot, index: int) -> np.ndarray:
+        exposure_ms = self._exposure_of(shot)
         electrons = exposure_ms * self._electrons_per_ms(*light, shot)
         return self.detect(electrons, exposure_ms=exposure_ms, noise_seed=[self.options.seed, index])
 
-    def expose(self, shot: Shot, index: int, *, exposure: float = 1.0) -> SimulatedImage:
-        """Return the image of a shot as `image` does, with its light; ``exposure`` multiplies the exposure time."""
+    def expose(self, shot: Shot, index: int, *, exposure: float = 1.0, bright_share: float = 0.0) -> SimulatedImage:
+        """Return the image of a shot as `image` does, with its light; ``exposure`` multiplies the exposure time.
+
+        An automatic exposure is shortened until at most ``bright_share`` (if not 0) of pixels exceed ``auto_level``.
+        """
         even, laser = self.light(shot, index)
-        exposure_ms = exposure * self._exposure_of(shot)
+        per_ms, exposure_ms = self._electrons_per_ms(even, laser, shot), exposure * self._exposure_of(shot)
+        if bright_share > 0 and self.sensor.exposure.described_ms(shot.light) == "auto":
+            exposure_ms = min(exposure_ms, self._level_e / max(float(np.quantile(per_ms, 1 - bright_share)), 1e-9))
         nothing = np.zeros_like(even)
 
         def to_electrons(light: np.ndarray, shares: np.ndarray | None = None) -> np.ndarray:
@@ -347,7 +353,7 @@ class SensorSimulator:
         if laser is not None:
             parts = [laser.direct(), laser.haze, laser.scattered - laser.haze, laser.particles]
         parts = [*(to_electrons(part, self._laser_shares) for part in parts), to_electrons(even)]
-        image = self._render_image((even, laser), shot, index, exposure=exposure)
+        image = self.detect(exposure_ms * per_ms, exposure_ms=exposure_ms, noise_seed=[self.options.seed, index])
         return SimulatedImage(image, exposure_ms, *parts)
 
     def detect(self, electrons: np.ndarray, *, exposure_ms: float, noise_seed: list[int]) -> np.ndarray:
@@ -396,7 +402,7 @@ class SensorSimulator:
 
     def _exposure(self, light: Light, probe: Literal["scan", "middle"]) -> float:
         """Return the described exposure in ms, or that which brings the brightest shot to the wanted level."""
-        wanted = self.sensor.exposure.laser_ms if light == "laser" else self.sensor.exposure.lamp_ms
+        wanted = self.sensor.exposure.described_ms(light)
         if wanted != "auto":
             return wanted
         shots = [shot for shot in self.scene.motion.shots() if shot.light == light]
@@ -412,5 +418,4 @@ class SensorSimulator:
             lit = peaks[peaks > LIT_SHARE * reference]
             brightest = max(brightest, float(np.quantile(lit, BRIGHT_SHARE)) if len(lit) else 0.0)
         longest = self.sensor.exposure.longest_ms
-        level = self.sensor.exposure.auto_level * self.sensor.detector.full_well_e
-        return min(longest, level / brightest) if brightest > 0 else longest
+        return min(longest, self._level_e / brightest) if brightest > 0 else longest

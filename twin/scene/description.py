@@ -52,6 +52,8 @@ class Plate(FlatObject):
     width_mm: Positive
     height_mm: Positive
 
+    _relief_has_uv: ClassVar[bool] = True
+
 
 class Block(FlatObject):
     """A box centred at its own origin.
@@ -89,6 +91,8 @@ class Mesh(SceneObject):
     kind: Literal["mesh"]
     path: str
     scale: Positive = 1.0
+
+    _relief_has_uv: ClassVar[bool] = True
 
 
 class PrintedPlate(SceneObject, ABC):

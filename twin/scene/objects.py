@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, assert_never, cast
 
 import drjit as dr
@@ -15,9 +15,9 @@ import trimesh
 from twin.backend.arrays import Bool, Float, Int32, SurfaceInteraction3f, UInt32, to_jit
 from twin.scene.description import AnyObject, Ball, Block, CirclePlate, Mesh, Pipe, Plate, Scene, TargetPlate
 from twin.scene.finish import albedo_parts, body_spread, finish_bsdf, register_textures, view_along_normal
-from twin.scene.forms.triangles import bowed_plate, rounded_box
+from twin.scene.forms.triangles import add_relief, bowed_plate, rounded_box, tube
 from twin.scene.scene_object import FreeForm
-from twin.scene.surfaces import GAUSSIANS
+from twin.scene.surfaces import GAUSSIANS, LateralSpread
 from uwlts.errors import DescriptionError
 from uwlts.files.reading import require_regular_file
 
@@ -27,7 +27,8 @@ _BLOCK_FACES = [np.roll(np.eye(3), shift, axis=1) @ np.diag([1, sign, sign]) for
 """Right-handed axes (3, 3) of a block's faces; the third one is the outward normal."""
 _CYLINDER_AXIS_TO_X = np.array([[0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1.0]])
 _SURFACE_STREAM = 11
-"""Random number stream of surfaces, separate from those of print errors."""
+_RELIEF_STREAM = 12
+"""Random number streams of reflectances and reliefs, separate from those of print errors."""
 # At a cosine of 0 no light is sampled: use the albedo at a small cosine instead.
 _ALBEDO_COSINES = np.maximum(np.linspace(0.0, 1.0, 65), 1e-3)
 
@@ -149,7 +150,12 @@ def build_objects(
     things = scene.objects
     placed = list(zip(things, scene.object_poses(), strict=True))
     shapes = [
-        _shape(thing, pose, finish_bsdf(thing, gloss=gloss, pose=pose, seed=(seed, number, _SURFACE_STREAM), **optics))
+        _shape(
+            thing,
+            pose,
+            finish_bsdf(thing, gloss=gloss, pose=pose, seed=(seed, number, _SURFACE_STREAM), **optics),
+            seed=(seed, number, _RELIEF_STREAM),
+        )
         for number, (thing, pose) in enumerate(placed)
     ]
     flat = np.zeros_like(_ALBEDO_COSINES), np.ones_like(_ALBEDO_COSINES)
@@ -164,15 +170,11 @@ def build_objects(
         "polarisation": [thing.polarisation() for thing in things],
         "roughness_um": [thing.finish_properties().roughness_um for thing in things],
         "number": list(range(len(things))),
-        "two_sided": [isinstance(thing, (Mesh, FreeForm)) for thing in things],
+        "two_sided": [_is_two_sided(thing) for thing in things],
         "albedo_black": [black for black, _ in parts],
         "albedo_per_unit": [per_unit for _, per_unit in parts],
         "retroreflection": [thing.retroreflection for thing in things],
-        "spread_weights": [spread.weights for spread in spreads],
-        "spread_variances_mm2": [spread.variances_mm2 for spread in spreads],
-        "spread_path_mm": [spread.path_mm for spread in spreads],
-        "spread_decay": [spread.decay for spread in spreads],
-        "spread_index": [spread.index for spread in spreads],
+        **{f"spread_{each.name}": [getattr(spread, each.name) for spread in spreads] for each in fields(LateralSpread)},
     }
     # With optimisation, Mitsuba would merge meshes of equal BSDF into one shape. Without robust intersections, one ray
     # in about ten thousand would pass through the edge between two facets.
@@ -204,61 +206,84 @@ def _arrange_by_registry(shapes: list[mi.Shape], values: np.ndarray) -> Float:
     return flat
 
 
-def _shape(thing: AnyObject, pose: np.ndarray, bsdf: mi.BSDF) -> mi.Shape:
-    """Return the shape of an object at its pose (4, 4) in the scene."""
+def _shape(thing: AnyObject, pose: np.ndarray, bsdf: mi.BSDF, *, seed: tuple[int, ...]) -> mi.Shape:
+    """Return the shape of an object at its pose (4, 4) in the scene; ``seed`` is that of its relief.
+
+    Under a relief, facets of spheres and pipes deviate by less than 2e-4 of the diameter.
+    """
+    rough, matrix, kind = thing.finish_properties().relief_mm > 0, pose, ""
+    surface: tuple[np.ndarray, ...] = ()  # vertices (V, 3), faces (F, 3) and, of some, texture coordinates (V, 2)
     match thing:
+        case Mesh():
+            surface = _surface_from_file(thing)
+        case FreeForm():
+            surface = thing.surface()
+        case Ball() if rough:
+            ball = trimesh.creation.icosphere(subdivisions=5, radius=thing.diameter_mm / 2)
+            surface = ball.vertices, ball.faces
         case Ball():
             matrix = pose.copy()
             if thing.texture is None:
                 matrix[:3, :3] = np.eye(3)  # Mitsuba mistakes rounding errors of a rotated sphere for shear
             matrix, kind = matrix @ _make_scaling(*[thing.diameter_mm / 2] * 3), "sphere"
         case Block() if thing.edge_radius_mm > 0:
-            return _mesh(rounded_box(np.array(thing.size_mm), radius_mm=thing.edge_radius_mm), pose, bsdf)
+            surface = rounded_box(np.array(thing.size_mm), radius_mm=thing.edge_radius_mm)
+        case Block() if rough:
+            box = trimesh.creation.box(thing.size_mm)
+            surface = box.vertices, box.faces
         case Block():
             matrix, kind = pose @ _make_scaling(*(side / 2 for side in thing.size_mm)), "cube"
+        case Pipe() if rough:
+            around = np.linspace(0, 2 * np.pi, 360, endpoint=False)
+            surface = tube(np.array([-0.5, 0.5]) * thing.length_mm, around, np.full((2, 360), thing.diameter_mm / 2))
         case Pipe():
             matrix = _CYLINDER_AXIS_TO_X @ _make_scaling(thing.diameter_mm / 2, thing.diameter_mm / 2, thing.length_mm)
             matrix[0, 3] = -thing.length_mm / 2
             matrix, kind = pose @ matrix, "cylinder"
         case CirclePlate() | TargetPlate() if thing.bow_mm != 0:
-            return _mesh(bowed_plate(*thing.bounds_mm(), bow_mm=thing.bow_mm), pose, bsdf)
+            surface = bowed_plate(*thing.bounds_mm(), bow_mm=thing.bow_mm)
         case CirclePlate() | TargetPlate():
             first, last = thing.bounds_mm()
             matrix = _FACING_SENSOR @ _make_scaling(*(last - first) / 2, 1)
             matrix[:2, 3] = (first + last) / 2
             matrix, kind = pose @ matrix, "rectangle"
-        case Mesh() | FreeForm():
-            surface = thing.surface() if isinstance(thing, FreeForm) else _surface_from_file(thing)
-            return _mesh(surface, pose, mi.load_dict({"type": "twosided", "bsdf": bsdf}))
         case Plate():
-            matrix = pose @ _FACING_SENSOR @ _make_scaling(thing.width_mm / 2, thing.height_mm / 2, 1)
-            kind = "rectangle"
+            half = np.array([thing.width_mm, thing.height_mm]) / 2
+            surface = bowed_plate(-half, half, bow_mm=0.0, cells=1) if rough else ()
+            matrix, kind = pose @ _FACING_SENSOR @ _make_scaling(*half, 1), "rectangle"
         case _:
             assert_never(thing)
+    if surface:
+        if rough:
+            surface = add_relief(surface, thing.finish_properties(), np.random.default_rng(seed))
+        return _mesh(surface, pose, mi.load_dict({"type": "twosided", "bsdf": bsdf}) if _is_two_sided(thing) else bsdf)
     return mi.load_dict({"type": kind, "to_world": mi.ScalarTransform4f(matrix), "bsdf": bsdf})
 
 
-def _mesh(surface: tuple[np.ndarray | None, ...], pose: np.ndarray, bsdf: mi.BSDF) -> mi.Mesh:
+def _is_two_sided(thing: AnyObject) -> bool:
+    return isinstance(thing, (Mesh, FreeForm)) or thing.finish_properties().relief_mm > 0
+
+
+def _mesh(surface: tuple[np.ndarray, ...], pose: np.ndarray, bsdf: mi.BSDF) -> mi.Mesh:
     """Return a triangle mesh with its vertices in scene coordinates.
 
     ``surface`` has vertices (V, 3) in the object's own frame and faces (F, 3), and may have texture coordinates (V, 2).
     """
-    vertices, faces, uv = (*surface, None)[:3]
-    assert vertices is not None and faces is not None
+    vertices, faces, *uv = surface
     vertices = vertices @ pose[:3, :3].T + pose[:3, 3]
     properties = mi.Properties()
     properties["bsdf"] = bsdf
-    mesh = mi.Mesh("mesh", len(vertices), len(faces), properties, has_vertex_texcoords=uv is not None)
+    mesh = mi.Mesh("mesh", len(vertices), len(faces), properties, has_vertex_texcoords=bool(uv))
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = np.ravel(vertices).astype(np.float32)
     parameters["faces"] = np.ravel(faces).astype(np.uint32)
-    if uv is not None:
-        parameters["vertex_texcoords"] = np.ravel(uv).astype(np.float32)
+    if uv:
+        parameters["vertex_texcoords"] = np.ravel(uv[0]).astype(np.float32)
     parameters.update()
     return mesh
 
 
-def _surface_from_file(thing: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+def _surface_from_file(thing: Mesh) -> tuple[np.ndarray, ...]:
     """Read vertices (V, 3), faces (F, 3) and, if every part has them, texture coordinates (V, 2) of a mesh file.
 
     Parts are concatenated here: trimesh would also copy their materials, which requires an imaging library.
@@ -289,7 +314,7 @@ def _surface_from_file(thing: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray 
     everywhere = len(known) == len(uv)
     if thing.texture is not None and not everywhere:
         raise DescriptionError(f"{path} has no texture coordinates for {thing.texture}: add them, or omit the texture")
-    return thing.scale * corners, triangles, np.concatenate(known) if everywhere else None
+    return thing.scale * corners, triangles, *([np.concatenate(known)] if everywhere else [])
 
 
 def _require_surface(part: trimesh.Trimesh, path: str) -> None:

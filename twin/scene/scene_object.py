@@ -51,6 +51,10 @@ class SceneObject(Pose):
     ``mean_free_path_mm`` is the transport mean free path of light in a translucent body, which widens the stripe and
     shifts it ahead along the laser's direction (`twin.scene.surfaces`); 0 for an opaque one.
 
+    The surface is displaced along its normals by random heights of the rms ``relief_mm``, so that slopes, shadows and
+    the stripe's path follow; ``relief_length_mm`` is the correlation length, one or one along each axis, and
+    ``relief_exponent`` the Hurst exponent (`twin.scene.forms.triangles.add_relief`).
+
     ``retroreflection`` is the coefficient of retroreflected luminance in cd/m2/lx (CIE 17-24-104), for tapes and marks
     that return the light of the lamp beside the camera. The laser is too far beside: its stripe shows ``reflectance``.
     """
@@ -66,12 +70,16 @@ class SceneObject(Pose):
     patch_share: Annotated[float, Field(ge=0, le=0.8)] | None = None
     patch_length_mm: Positive | None = None
     patch_reflectance: Reflectance | None = None
+    relief_mm: NotNegative | None = None
+    relief_length_mm: Positive | tuple[Positive, Positive, Positive] | None = None
+    relief_exponent: Annotated[float, Field(gt=0, le=1)] | None = None
     retroreflection: NotNegative = 0.0
 
     _no_texture: ClassVar[str] = ""
     """Reason why objects of a class have no picture as texture."""
     _no_mottle: ClassVar[str] = ""
     """Reason why the reflectance of objects of a class does not vary."""
+    _relief_has_uv: ClassVar[bool] = False  # whether a picture can be on a relief
 
     @model_validator(mode="after")
     def _check_finish(self) -> Self:
@@ -80,11 +88,11 @@ class SceneObject(Pose):
             raise ValueError(f"texture {self.texture} {self._no_texture}")
         if finish.reflection == "diffuse" and self.alpha is not None:
             raise ValueError(f"alpha {self.alpha:g} is for glossy finishes, but finish is '{self.finish}': omit alpha")
-        for name in ("mottle", "patch_share"):
+        for name in ("mottle", "patch_share", "relief_mm"):
             value = getattr(finish, name)
             if value > 0 and self._no_mottle:
                 raise ValueError(f"{name} {value:g} of the finish '{self.finish}' {self._no_mottle} {name} = 0")
-            if value > 0 and self.texture is not None:
+            if value > 0 and self.texture is not None and not (name == "relief_mm" and self._relief_has_uv):
                 raise ValueError(f"texture {self.texture} and {name} {value:g}: use one of them, or {name} = 0")
         if finish.mean_free_path_mm > 0 and finish.reflection == "metal":
             raise ValueError(f"mean_free_path_mm {finish.mean_free_path_mm:g} in a metal: light does not enter it")
@@ -129,6 +137,8 @@ class FlatObject(SceneObject):
         if finish.reflectance + self.mirror > 1:
             both = f"reflectance {finish.reflectance:g} and mirror {self.mirror:g}"
             raise ValueError(f"{both} add up to more than 1: reduce one of them")
+        if self.mirror > 0 and finish.relief_mm > 0:
+            raise ValueError(f"mirror {self.mirror:g} on a relief of {finish.relief_mm:g} mm: use one of them")
         if self.mirror > 0 and finish.reflection in ("painted", "pvc"):
             raise ValueError(f"mirror {self.mirror:g} under a coat: use the finish 'diffuse' or 'metal' for a mirror")
         return self

@@ -55,6 +55,9 @@ class FinishProperties:
     patch_share: float = 0.0
     patch_length_mm: float = 5.0
     patch_reflectance: float = 0.03
+    relief_mm: float = 0.0
+    relief_length_mm: float | Lengths = 2.0
+    relief_exponent: float = 0.5
 
 
 # Sources. Roughness of coats and metal (alpha): a satin paint, an extruded pipe, ground steel; assumed. Light from a

@@ -532,6 +532,10 @@ class Exposure(Description):
     auto_level: Annotated[float, Field(gt=0.05, lt=1)] = 0.8
     longest_ms: Positive = 1000.0
 
+    def described_ms(self, light: str) -> float | Literal["auto"]:
+        """Return the exposure of images under a light: "laser", or "lamp" and "day"."""
+        return self.laser_ms if light == "laser" else self.lamp_ms
+
 
 class Lamp(Description):
     """Light other than the laser's, as irradiance on every surface at the laser's wavelength.

@@ -38,10 +38,10 @@ _STRIPE, _NEAR, _FAR = 1.5, (3.0, 5.0), (6.0, 20.0)
 """Distances from the centre, in full widths at half maximum, of the stripe, its halo and the background."""
 _LEAST_LIGHT = 0.2
 """Least smooth light, of its mean: where a parabola falls below it, the stripe ends in the window."""
-_CROP_PX = 60
-"""Half the height of the pictures of windows, px: the stripe and its halo."""
-_PICTURES = 8
-"""Largest number of pictures of an image: a page shows all of them."""
+_LEAST_RISE = 0.5
+"""Least rise above the brighter side, of that above the darker one: halfway from a printed edge, 0, to a stripe, 1."""
+_CROP_PX = 60  # half the height of the pictures of windows: the stripe and its halo
+_PICTURES = 8  # largest number of pictures of an image: a page shows all of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,7 +214,7 @@ def measure_windows(images: ImageSet, *, most_images: int) -> StripeWindows:
     """Measure the stripe in all windows of up to ``most_images`` images.
 
     A window has `WINDOW_LINES` consecutive lines of a stripe without a jump or a long gap, and stripe centres on half
-    of them. Windows whose background is outside the image are left out.
+    of them. Windows on printed edges, or with their background outside the image, are left out.
     """
     values, numbers, pictures = [], [], []
     for number, image in enumerate(images.images(most_images)):
@@ -224,8 +224,7 @@ def measure_windows(images: ImageSet, *, most_images: int) -> StripeWindows:
         profiles = (image if images.stripe_along == "height" else image.T).astype(np.float32) / images.full_dn
         windows = []
         for lines in _windows(stripe, images.options.jump_px):
-            found = _measure(profiles[lines], stripe, lines)
-            if found is not None:
+            if (found := _measure(profiles[lines], stripe, lines)) is not None:
                 values.append(found)
                 numbers.append(number)
                 windows.append(lines)
@@ -239,10 +238,9 @@ def _windows(stripe: Stripe, jump_px: float) -> Iterator[np.ndarray]:
     """Yield the lines (`WINDOW_LINES`,) of all windows."""
     found = stripe.lines
     gaps = (np.diff(found) > LONGEST_GAP + 1) | (np.abs(np.diff(stripe.centre_px[found])) > jump_px)
-    for run in np.split(found, np.flatnonzero(gaps) + 1):
-        if len(run):
-            for first in range(int(run[0]), int(run[-1]) + 2 - WINDOW_LINES, WINDOW_LINES):
-                yield np.arange(first, first + WINDOW_LINES)
+    for run in (each for each in np.split(found, np.flatnonzero(gaps) + 1) if len(each)):
+        for first in range(int(run[0]), int(run[-1]) + 2 - WINDOW_LINES, WINDOW_LINES):
+            yield np.arange(first, first + WINDOW_LINES)
 
 
 def _measure(profiles: np.ndarray, stripe: Stripe, lines: np.ndarray) -> list[float] | None:
@@ -252,17 +250,19 @@ def _measure(profiles: np.ndarray, stripe: Stripe, lines: np.ndarray) -> list[fl
         return None
     profiles, centre = profiles[held], stripe.centre_px[lines[held]]
     width = float(np.median(stripe.width_px[lines[held]]))
-    dist = np.abs(np.arange(profiles.shape[1]) - centre[:, None]) / width
-    within, near, far = (dist <= _STRIPE, (dist > _NEAR[0]) & (dist < _NEAR[1]), (dist > _FAR[0]) & (dist < _FAR[1]))
+    signed = (np.arange(profiles.shape[1]) - centre[:, None]) / width
+    dist = np.abs(signed)
+    within, near, far = dist <= _STRIPE, (dist > _NEAR[0]) & (dist < _NEAR[1]), (dist > _FAR[0]) & (dist < _FAR[1])
     if not near.any() or np.count_nonzero(far) < far.shape[0]:
         return None
     background, beside = float(np.median(profiles[far])), float(np.median(profiles[near]))
     peak = float(np.median(np.where(within, profiles, 0.0).max(axis=1)))
     height = max(peak - background, 1e-6)
+    sides = [np.median(profiles[near & one]) for one in (signed < 0, signed > 0) if (near & one).any()]
     light = np.where(within, profiles - beside, 0.0).sum(axis=1)
     smooth = np.polynomial.Polynomial.fit(held, light, 2)(held)
     mean = float(light.mean())
-    if mean <= 0:
+    if mean <= 0 or peak - max(sides) < _LEAST_RISE * (peak - min(sides)):
         return None
     deviation = light / np.maximum(smooth, _LEAST_LIGHT * mean) - 1.0
     next_to = np.flatnonzero(np.diff(held) == 1)
@@ -295,5 +295,4 @@ def _cut_picture(profiles: np.ndarray, stripe: Stripe, lines: np.ndarray) -> np.
     middle = round(float(np.nanmedian(stripe.centre_px[lines])))
     place = middle + np.arange(-_CROP_PX, _CROP_PX + 1)
     inside = (place >= 0) & (place < profiles.shape[1])
-    shown = np.where(inside, profiles[lines][:, np.clip(place, 0, profiles.shape[1] - 1)], 0.0)
-    return shown.T.astype(np.float32)
+    return np.where(inside, profiles[lines][:, np.clip(place, 0, profiles.shape[1] - 1)], 0.0).T.astype(np.float32)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from twin.datasets.data_set import DataSetDescription, LogUniform, Normal, OneOf, Uniform, load_description
+from twin.datasets.data_set import DataSetDescription, Normal, OneOf, Uniform, load_description
 from twin.datasets.generation import choose_split, draw_scene
 from uwlts.errors import DescriptionError
 from uwlts.model.library import list_names
@@ -26,7 +26,7 @@ def described(**changes: object) -> DataSetDescription:
 SHARES = np.linspace(0.005, 0.995, 199)
 EXPECTED = {
     "uniform": (Uniform(kind="uniform", least=-2.0, most=6.0), stats.uniform(-2.0, 8.0)),
-    "log_uniform": (LogUniform(kind="log_uniform", least=0.1, most=40.0), stats.loguniform(0.1, 40.0)),
+    "log_uniform": (Uniform(kind="log_uniform", least=0.1, most=40.0), stats.loguniform(0.1, 40.0)),
     "normal": (Normal(kind="normal", mean=3.0, std=2.0), stats.norm(3.0, 2.0)),
     "cut": (Normal(kind="normal", mean=3.0, std=2.0, least=2.0, most=9.0), stats.truncnorm(-0.5, 3.0, 3.0, 2.0)),
 }

@@ -19,7 +19,7 @@ import webdataset
 
 import twin
 from tests.virtual_sensors import altered
-from twin.datasets.data_set import DataSetDescription
+from twin.datasets.data_set import DataSetDescription, LineStatus
 from twin.datasets.generation import draw_scene
 from uwlts.errors import ArgumentError, CaptureError, DescriptionError, DesignError, OutputError
 from uwlts.files.json_files import json_text
@@ -129,6 +129,17 @@ def test_another_data_set_is_refused_unless_it_is_to_be_replaced(folder, tmp_pat
         twin.dataset(small(), out=place, workers=0)
     with pytest.raises(OutputError, match="cannot use the folder"):
         twin.dataset(small(), out=place / "mine.txt", workers=1)
+
+
+def test_long_exposures_in_daylight_leave_images_that_show_the_stripe(tmp_path):
+    day = {"lamp": {"ambient_w_per_m2": 30.0}, "exposure": {"laser_ms": "auto"}}
+    changes = {"sensor": altered(load_sensor("thesis"), SMALL | day), "scenes": 2, "labels": ("centre",)}
+    long = {"frame.exposure": {"kind": "constant", "value": 50.0}}
+    shown = twin.load_dataset(twin.dataset(small(**changes, vary=long), out=tmp_path / "day", workers=1))
+    for sample in shown:
+        # 3 % may be above 0.8 of full scale; without the limit, the sphere and the stripe would be white.
+        assert np.quantile(sample["image"], 0.98) > 0.8 * 255 and (sample["image"] > 0.85 * 255).mean() < 0.05
+        assert (sample["status"] != LineStatus.NOT_CROSSED).sum() > 10 and sample["info"]["exposure_ms"] > 0
 
 
 def test_scenes_that_the_sensor_cannot_see_are_drawn_anew(tmp_path, monkeypatch):

@@ -244,6 +244,22 @@ def test_a_retroreflecting_mark_returns_lamp_light_only(thesis):
     np.testing.assert_array_equal(with_laser, laser)
 
 
+def test_daylight_from_one_half_space_shades_a_tilted_surface(thesis):
+    sensor = altered(thesis, {"lamp": {"ambient_w_per_m2": 2.0}, "camera": {"width_px": 64, "height_px": 48}})
+    tilted = plate() | {"rotation_deg": (60.0, 0.0, 0.0)}
+    level, turned = (
+        Renderer(sensor, clear(), scene_of(thing), effects=replace(NONE, ambient=True)).irradiance(
+            "day", sensor_at(), spp=4
+        )
+        for thing in (plate(), tilted)
+    )
+    # Directions of the half-space about -Z, evenly on a lattice of both angles; those behind the surface give nothing.
+    height, turn = np.meshgrid((np.arange(200) + 0.5) / 200, 2 * math.pi * (np.arange(400) + 0.5) / 400)
+    towards = np.sqrt(1 - height**2) * np.sin(turn) * math.sin(math.radians(60)) + height * math.cos(math.radians(60))
+    share = np.maximum(towards, 0).mean() / height.mean()
+    np.testing.assert_allclose((turned / level)[20:28, 28:36], share, rtol=2e-3)
+
+
 @pytest.mark.parametrize("light", ["day", "lamp"])
 def test_turbid_water_veils_what_day_and_lamp_light(thesis, light):
     """Duntley's equation, with the backscattered fraction of the lamp's light by Henyey and Greenstein."""

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from matplotlib.tri import LinearTriInterpolator, Triangulation
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr
 
@@ -32,6 +33,9 @@ from twin.recording.frame_truth import (
     project_points,
 )
 from twin.rendering_options import NONE, Effects
+from twin.scene.forms.triangles import add_relief, bowed_plate
+from twin.scene.objects import _RELIEF_STREAM
+from twin.scene.surfaces import FinishProperties
 from uwlts.model.sensor import Sensor
 from uwlts.storage.truth import TruthStatus
 
@@ -90,6 +94,24 @@ def test_the_rendered_stripe_lies_about_its_true_centre(thesis):
         # 256 per pixel is of the same size.
         assert np.abs((centroid - truth.centre_px).mean()) < 2e-3
         np.testing.assert_allclose(centroid, truth.centre_px, rtol=0, atol=0.01)
+
+
+def test_truth_on_a_relief_is_that_of_the_displaced_surface(thesis):
+    """Points lie on the facets, by interpolation in them, and are seen where light of least time shows them."""
+    rough = plate(side=200.0) | {"relief_mm": 0.3, "relief_length_mm": 4.0}
+    renderer = Renderer(thesis, clear(0.3), scene_of(rough), effects=NONE, seed=3)
+    truth = true_points(renderer, sensor_at(), 800)
+    half = np.array([100.0, 100.0])
+    own = FinishProperties("diffuse", relief_mm=0.3, relief_length_mm=4.0)
+    drawn = add_relief(
+        bowed_plate(-half, half, bow_mm=0.0, cells=1), own, np.random.default_rng((3, 0, _RELIEF_STREAM))
+    )
+    (x, y, z), facets = drawn[0].T, Triangulation(*drawn[0][:, :2].T, drawn[1])
+    height = LinearTriInterpolator(facets, z)(*truth.point_mm[:, :2].T)
+    assert height.std() > 0.2 and np.ptp(x) == np.ptp(y)
+    np.testing.assert_allclose(truth.point_mm[:, 2], height, rtol=0, atol=3 * SURFACE_MM)
+    seen = seen_at(thesis, clear(0.3), truth.point_mm)
+    np.testing.assert_allclose(seen[:, 1], truth.centre_px, rtol=0, atol=3 * CENTRE_PX)
 
 
 def distance_to_sphere(points: np.ndarray, centre: np.ndarray, diameter: float) -> np.ndarray:

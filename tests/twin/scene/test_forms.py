@@ -10,8 +10,9 @@ from pydantic import ValidationError
 from twin.scene.forms import Flange, Seabed
 from twin.scene.forms.parts import flange_face
 from twin.scene.forms.seabed import _sediment_height
-from twin.scene.forms.triangles import rounded_box
+from twin.scene.forms.triangles import add_relief, bowed_plate, rounded_box
 from twin.scene.scene_object import FreeForm
+from twin.scene.surfaces import FinishProperties
 
 
 def seabed_height(bed: Seabed, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -130,3 +131,38 @@ def test_a_block_with_rounded_edges_is_a_box_moved_by_a_sphere():
     # Every point of the surface has the distance of the radius from the inner box.
     beyond = np.maximum(np.abs(middles(mesh)) - (size / 2 - radius), 0)
     assert np.abs(np.linalg.norm(beyond, axis=1) - radius).max() < 1.2e-3 * radius
+
+
+@pytest.mark.parametrize("hurst", [0.3, 0.7])
+def test_heights_of_a_relief_have_the_described_spectrum(hurst):
+    """Against the structure function of the spectral density (1 + q^2)^-(H + 3/2), by quadrature to the finest wave."""
+    own = FinishProperties("diffuse", relief_mm=0.2, relief_length_mm=2.0, relief_exponent=hurst)
+    found, side = [], 257
+    for seed in range(2):
+        surface = bowed_plate(np.array([-20.0, -20.0]), np.array([20.0, 20.0]), bow_mm=0.0, cells=1)
+        vertices, _, uv = add_relief(surface, own, np.random.default_rng(seed))
+        # A plate is displaced along z only, and its texture stays where it was.
+        np.testing.assert_allclose(vertices[:, 0] / 40 + 0.5, uv[:, 0], atol=1e-9)
+        place = vertices[:, :2] * 256 / 40
+        regular = vertices[np.abs(place - np.round(place)).max(axis=1) < 1e-6]
+        z = regular[np.lexsort(np.round(regular[:, :2].T, 6)), 2].reshape(side, side)
+        steps = np.round(np.array([0.5, 1.0, 2.0]) * (side - 1) / 40).astype(int)
+        found.append([z.var(), *(np.mean(np.square(z[k:] - z[:-k])) / 2 for k in steps)])
+    # Facets of up to 2 sqrt(area / 150,000).
+    number = np.linspace(0, math.pi * 2.0 / (2 * math.sqrt(40 * 40 / 150_000)), 20_000)[1:]
+    power = number**2 * (1 + number**2) ** -(hurst + 1.5)
+    lag = steps * 40 / (side - 1) / 2.0
+    expected = [1.0, *(power @ (1 - np.sinc(number * each / math.pi)) / power.sum() for each in lag)]
+    # Two plates of 20 x 20 patches have the variance to 5 %, by waves of several patches to 10 %: three of these.
+    np.testing.assert_allclose(np.mean(found, axis=0), 0.04 * np.array(expected), rtol=0.3)
+
+
+def test_a_relief_follows_normals_and_closes_its_surface():
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=20.0)
+    own = FinishProperties("diffuse", relief_mm=0.1, relief_length_mm=5.0)
+    vertices, faces = add_relief((ball.vertices, ball.faces), own, np.random.default_rng(1))
+    whole, radius = trimesh.Trimesh(vertices, faces, process=False), np.linalg.norm(vertices, axis=1)
+    assert whole.is_watertight and whole.volume > 0
+    # 50 independent patches have the rms to 10 %; facets of the ball lie up to 20 mm 2 (pi / 80)^2 / 2 within it.
+    assert radius.std() == pytest.approx(0.1, rel=0.3)
+    assert 19.9 < radius.mean() < 20.02

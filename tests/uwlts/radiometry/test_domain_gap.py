@@ -123,6 +123,19 @@ def test_photographs_give_direction_and_saturation():
     assert np.median(table[:, NAMES.index("clipped")]) == 100
 
 
+def test_windows_on_printed_edges_are_left_out(tmp_path: Path):
+    """Edges from black to white are bright on one side to their brightest pixel; a stripe on such a board is kept."""
+    rng = np.random.default_rng(6)
+    board = np.where(np.arange(240) < 130, 40, 140)
+    edges = [np.clip(rng.normal(cv2.GaussianBlur(np.tile(board, (320, 1)).astype(float), (0, 0), 3), 1), 0, 255)]
+    # The lens sharpens edges: their brightest pixel is 30 grey values above the white.
+    edges[0][:, 134:138] += 30
+    stripes = [draw(rng), np.clip(draw(rng) + 0.2 * board, 0, 255)]
+    images = [each.astype(np.uint8) for each in (*stripes, *edges)]
+    found = measure_windows(open_image_set(write(tmp_path / "board", images)), most_images=5)
+    assert np.unique(found.image).tolist() == [0, 1]
+
+
 def test_sets_that_cannot_be_used_are_refused(tmp_path: Path):
     black = write(tmp_path / "black", [np.zeros((200, 300), np.uint8)])
     short = write(tmp_path / "short", [draw(np.random.default_rng(5))])

@@ -3,10 +3,16 @@
 from collections.abc import Iterable
 
 import numpy as np
+import trimesh
+from scipy.ndimage import map_coordinates
+from scipy.spatial.transform import Rotation
 
+from twin.scene.surfaces import FinishProperties
 from uwlts.errors import DescriptionError
 
 _MOST_VERTICES = 4_000_000  # some 300 MB in the renderer
+_RELIEF_VERTICES = 150_000  # approximate largest number on an object with relief
+_RELIEF_CELLS = 96  # of the field of a relief along each axis, of a twentieth of the correlation length or more
 
 
 def require_few_vertices(vertices: int, *, step_mm: float, advice: str) -> None:
@@ -139,3 +145,32 @@ def rounded_box(size_mm: np.ndarray, *, radius_mm: float) -> tuple[np.ndarray, n
     # Triangles at the poles have no area.
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return vertices, faces[np.linalg.norm(np.cross(b - a, c - a), axis=1) > 0]
+
+
+def add_relief(
+    surface: tuple[np.ndarray, ...], own: FinishProperties, rng: np.random.Generator
+) -> tuple[np.ndarray, ...]:
+    """Displace a surface along its normals by random heights.
+
+    ``surface`` is vertices (V, 3), faces (F, 3), and optionally texture coordinates (V, 2). The heights are a Gaussian
+    field in space with the spectral density (1 + q^2)^-(H + 3/2) (von Karman). The wave vector q is in units of the
+    inverse correlation lengths, and H is the Hurst exponent. Waves are not shorter than two facets, of a twentieth of
+    the correlation length or as small as `_RELIEF_VERTICES` allow.
+    """
+    vertices, faces, *uv = surface
+    lengths = np.ones(3) * own.relief_length_mm
+    area = trimesh.Trimesh(vertices, faces, process=False).area
+    step = max(float(lengths.min()) / 20, 2 * float(np.sqrt(area / _RELIEF_VERTICES)))
+    values, faces = trimesh.remesh.subdivide_to_size(np.hstack([vertices, *uv]), faces, step, max_iter=30)[:2]
+    fine, cell = trimesh.Trimesh(values[:, :3], faces, process=False), step / float(lengths.min())
+    # Fine and coarse waves; each field is periodic, but turned at random it does not repeat along a surface.
+    height, variance, number = np.zeros(len(values)), 0.0, np.fft.fftfreq(_RELIEF_CELLS)
+    for size, least in ((cell, 0.125 / cell), (4 * cell, 0.0)):
+        k = np.sqrt(number[:, None, None] ** 2 + number[:, None] ** 2 + number[: _RELIEF_CELLS // 2 + 1] ** 2) / size
+        density = (1 + (2 * np.pi * k) ** 2) ** -(own.relief_exponent + 1.5) * (k > least) * (k <= 0.5 / size)
+        field = np.fft.irfftn(np.fft.rfftn(rng.standard_normal((_RELIEF_CELLS,) * 3)) * np.sqrt(density / size**3))
+        places = fine.vertices / lengths @ Rotation.from_quat(rng.standard_normal(4)).as_matrix() / size
+        height += map_coordinates(field, places.T, order=3, mode="grid-wrap")
+        variance += field.var()
+    height *= own.relief_mm / np.sqrt(variance)
+    return fine.vertices + fine.vertex_normals * height[:, None], faces, *([values[:, 3:]] if uv else [])
