@@ -7,11 +7,13 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from scipy.spatial.transform import Rotation
 
 from tests.oracles import drawings
 from tests.system.in_process import uwlts
 from tests.system.test_imported_calibration import CENTRE, CHESSBOARD, SIZE, F, photographs, poses
 from uwlts.storage.import_.camera_files import read_intrinsics
+from uwlts.storage.mount_files import read_mount
 
 TARGET = 'kind = "chessboard"\ncolumns = 9\nrows = 6\nsquare_mm = 15.0\n'
 
@@ -59,6 +61,35 @@ def test_photographs_give_the_camera_and_name_what_was_left_out(folder: Path, tm
     # A second time it refuses to replace what it wrote.
     again = uwlts("camera", str(folder), "--target", str(tmp_path / "board.toml"), "--out", str(out))
     assert again.returncode != 0 and "exists" in again.stderr
+
+
+def test_photographs_give_the_mount_of_a_camera_without_a_laser(folder: Path, tmp_path: Path):
+    mount, target = (np.eye(4) for _ in range(2))
+    mount[:3, :3], mount[:3, 3] = Rotation.from_euler("xyz", (10, -35, 80), degrees=True).as_matrix(), (40, -25, 110)
+    target[:3, :3], target[:3, 3] = Rotation.from_euler("xyz", (170, 5, -10), degrees=True).as_matrix(), (700, 100, 50)
+    names, at = sorted(path.name for path in folder.glob("*.png")), {}
+    for number, (rotation, translation) in enumerate(poses(CHESSBOARD)):
+        seen = np.eye(4)
+        seen[:3, :3], seen[:3, 3] = rotation, translation
+        at[f"board{number}.png"] = target @ np.linalg.inv(seen) @ np.linalg.inv(mount)
+    rows = [at.get(name, np.eye(4)).ravel() for name in names]
+    np.savetxt(tmp_path / "poses.csv", rows, delimiter=",")
+    (folder / "target.toml").write_text(TARGET)
+    asked = ("mount", str(folder), str(tmp_path / "poses.csv"), "--out", str(tmp_path / "mount.json"))
+    refused, done = uwlts(*asked, "--radius-mm", "20"), uwlts(*asked)
+    np.savetxt(tmp_path / "poses.csv", rows[1:], delimiter=",")
+    fewer = uwlts(*asked, "--overwrite")
+    (folder / "target.toml").unlink()
+    assert refused.returncode == 2 and "photographs of a target need poses, and nothing else" in refused.stderr
+    assert fewer.returncode == 2 and "found 10 poses for 11 images" in fewer.stderr
+    assert done.returncode == 0, done.stderr
+    found = read_mount(tmp_path / "mount.json")
+    assert {pose.name: pose.reason is None for pose in found.poses} == {name: name in at for name in names}
+    # The robot is exact, but not known to be: four standard uncertainties, which contain those of the lens.
+    turn = Rotation.from_matrix(found.transform()[:3, :3] @ mount[:3, :3].T).as_rotvec()
+    error = np.append(found.transform()[:3, 3] - mount[:3, 3], turn)
+    assert (np.abs(error) < 4 * found.std()).all()
+    assert (np.abs(error[:3]) < 1.0).all() and np.degrees(np.abs(error[3:])).max() < 0.3
 
 
 def test_a_channel_that_is_none_is_refused(folder: Path, tmp_path: Path):

@@ -1,6 +1,8 @@
 """Scans without stops over real protocols: positions of frames, latency, and refusals."""
 
+import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -97,8 +99,8 @@ def true_places(capture: Capture, hill: Hill) -> np.ndarray:
 def test_frames_are_where_the_stage_was_whatever_the_clocks_differ_by(hill, tmp_path, monkeypatch):
     usual, said = continuous._compare_clocks, []
 
-    def compared(*about):
-        clock = usual(*about)
+    def compared(*about, **settings):
+        clock = usual(*about, **settings)
         return clock[0] + 0.02, clock[1]
 
     monkeypatch.setattr(continuous, "_compare_clocks", compared)
@@ -116,6 +118,27 @@ def test_frames_are_where_the_stage_was_whatever_the_clocks_differ_by(hill, tmp_
         # 0.2 ms; on a busy machine five standard errors of a pass's position from its reports, at least four.
         allowed_s = max(2e-4, 5 * scatter_s / np.sqrt(4))
         assert np.abs(error_s).max() < allowed_s
+
+
+@pytest.mark.parametrize("set_s", [-37.0, 0.2])
+def test_a_camera_s_clock_that_is_set_on_the_way_is_noticed(hill, tmp_path, monkeypatch, set_s):
+    """As by PTP, when the network finds its time."""
+    usual, count = hill.camera._expose, [0]
+
+    def off_s() -> float:
+        return set_s * (count[0] > COUNT // 2)
+
+    def later() -> ExposedFrame:
+        count[0] += 1
+        shot = usual()
+        return replace(shot, middle_s=shot.middle_s + off_s())
+
+    # Stamps of free-running and of triggered frames.
+    monkeypatch.setattr(hill.camera, "_expose", later)
+    monkeypatch.setattr(time, "monotonic_ns", lambda: round(1e9 * (time.monotonic() + off_s())))
+    with pytest.raises(HardwareError, match="clock"):
+        uwlts.scan(plan(tmp_path, hill, f"speed_mm_per_s = {SPEED}"), tmp_path / "a.h5", home=True)
+    assert not hill.controller.state().laser_on
 
 
 @pytest.mark.slow

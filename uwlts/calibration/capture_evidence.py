@@ -1,7 +1,7 @@
 """Evidence in captures for a calibration: target points, stripes on the target, stripes on the step standard."""
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -14,6 +14,7 @@ from uwlts.calibration.camera.image_quality import explain_missing_target
 from uwlts.calibration.target_stripes import TargetStripe, stripe_on_target
 from uwlts.errors import CalibrationError, DescriptionError, ImageError, TargetError, describe_problems
 from uwlts.model.artefacts import StepStandard
+from uwlts.model.sensor import CaptureHeader, Sensor
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.runtime.workers import map_in_threads
 from uwlts.storage.capture import Capture
@@ -103,7 +104,7 @@ def find_air_evidence(
     reasons: Counter[str] = Counter()
     for number, capture in enumerate(captures):
         first = len(images)
-        detect = partial(_detect_target, capture, targets[0], number)
+        detect = partial(detect_target, capture, targets[0], number)
         for (frame, _), found in map_in_threads(detect, capture.frames(laser_on=False)):
             if isinstance(found, str):
                 reasons[found] += 1
@@ -139,6 +140,44 @@ def find_air_evidence(
     names = [capture.path.name for capture in captures]
     no_stripe = "" if any(map(len, stripes)) else explain_captures_without_stripe(captures)
     return AirEvidence(targets[0], images, frames, stripes, warnings, no_stripe, outliers, names)
+
+
+def common_sensor(
+    captures: Sequence[Capture], *, also: Callable[[CaptureHeader], Mapping[str, object]] = lambda header: {}
+) -> Sensor:
+    """Return the first capture's sensor; ``also`` returns further values by name that all captures must share.
+
+    Raises CalibrationError if another capture has other optics or values, or there is no capture.
+    """
+    if not captures:
+        raise CalibrationError("no capture is given: a calibration needs one of a target")
+    sensor = captures[0].header.sensor
+
+    def shared(capture: Capture) -> dict[str, object]:
+        camera, laser = capture.header.sensor.camera, capture.header.sensor.laser
+        return {
+            "image size": f"{camera.width_px} x {camera.height_px} px",
+            "image offset": camera.offset_px,
+            "stripe_along": camera.stripe_along,
+            "wavelength": f"{laser.wavelength_nm:g} nm",
+            **also(capture.header),
+        }
+
+    for capture in captures[1:]:
+        own, other = shared(capture), shared(captures[0])
+        differ = ", ".join(
+            f"its {name} is {own[name]} instead of {other[name]}"
+            for name in own
+            if own[name] != other[name] and None not in (own[name], other[name])
+        )
+        if differ:
+            camera = capture.header.sensor.camera
+            turned = (camera.height_px, camera.width_px) == (sensor.camera.width_px, sensor.camera.height_px)
+            raise CalibrationError(
+                f"{capture.path.name} does not fit {captures[0].path.name}: {differ}"
+                + ("; the images of one are rotated by 90 deg" if turned and "size" in differ else "")
+            )
+    return sensor
 
 
 def step_evidence(
@@ -230,7 +269,7 @@ def _laser_frames(capture: Capture) -> Iterator[_Seen]:
         yield frame, capture.read_observation(frame)
 
 
-def _detect_target(
+def detect_target(
     capture: Capture, target: Target, placement: int, numbered: tuple[int, np.ndarray]
 ) -> tuple[TargetView, TargetImage] | str:
     """Find the target in an image with the laser off, or return the reason for rejection."""

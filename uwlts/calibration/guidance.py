@@ -21,7 +21,7 @@ from uwlts.calibration.camera.camera_parameters import (
     pose_values,
 )
 from uwlts.calibration.camera.image_quality import LaserFault
-from uwlts.calibration.camera.target_poses import CameraSolution, Poses, solve_camera
+from uwlts.calibration.camera.target_poses import CameraSolution, Poses, find_pose, solve_camera
 from uwlts.calibration.capture_evidence import StepEvidence
 from uwlts.calibration.sequential.sheet_fit import fit_sheet, points_on_target
 from uwlts.calibration.sequential.step_images import label_step
@@ -82,10 +82,8 @@ def estimate_pose(view: TargetView | TargetImage, camera: CameraModel) -> np.nda
 
     Raises CalibrationError if no pose fits the points.
     """
-    found, rotation, translation = cv2.solvePnP(view.points_mm, view.pixels, camera.matrix(), camera.coefficients())
-    if not found or not np.isfinite(translation).all():
-        raise CalibrationError("no pose of the target fits its image: is it the described target?")
-    return rigid_transform(cv2.Rodrigues(rotation)[0], translation[:, 0])
+    pose = find_pose(view.points_mm, view.pixels, camera.matrix(), camera.coefficients())
+    return rigid_transform(cv2.Rodrigues(pose[:3])[0], pose[3:])
 
 
 def judge_residual(before: CameraSolution | None, after: CameraSolution) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -39,6 +40,8 @@ _GAP_S = 0.8
 """Longest gap between frames while the laser is on, including the braking time. Its detection takes 0.1 s more."""
 _SLOW_REPORT = 2.0  # reports that took this many times as long as the fastest are ignored: their time is less certain
 _FEWEST_REPORTS = 4  # of the stage's position: two determine the motion, the others check it
+_SET_S = 0.1
+"""Least change of the offset between both clocks that is neither drift (100 ppm in 15 minutes) nor a busy computer."""
 _BUSY = 0.9  # largest fraction of the frame period that the exposure may take
 
 
@@ -119,11 +122,8 @@ def record_continuously(
     camera.stop()
     warm_up()  # before the laser is on: the first image would hold up the frames after it
     stage.move_to(passes[0][0], feed_mm_per_min=plan.stage.feed_mm_per_min)
-    camera.configure(**settings, trigger="software")
-    camera.start(faults="skip")
-    offset_s, encoder = _compare_clocks(camera, exposure_ms)
+    offset_s, encoder = _compare_clocks(camera, **settings)
     at_rest_mm = stage.position_mm()
-    camera.stop()
     together = continuous.profiles_per_frame
     rate_set = camera.configure(**settings, frame_rate_hz=rate_hz, profiles=together).frame_rate_hz
     if rate_set is None or abs(rate_set / rate_hz - 1) > 0.01:
@@ -158,6 +158,13 @@ def record_continuously(
             camera.stop()
         if reader.error is not None:
             raise reader.error
+        if continuous.mm_per_count is None:
+            set_s = _compare_clocks(camera, **settings)[0] - offset_s
+            if abs(set_s) > _SET_S:
+                raise HardwareError(
+                    f"the camera's clock was set by {-set_s:+.3g} s during the scan: positions of frames are "
+                    "not known: switch off its synchronisation (PTP), or wait until it has settled"
+                )
         if lost := camera.counts.dropped + camera.counts.short:
             warn(f"{lost} frames were lost between camera and computer: the steps there are larger")
         ends = sorted(passes[0])
@@ -165,15 +172,18 @@ def record_continuously(
         return reader.assign_positions(continuous, (ends[0] + ramp, ends[1] - ramp), (at_rest_mm, encoder), warn)
 
 
-def _compare_clocks(camera: CameraDevice, exposure_ms: float) -> tuple[float, int | None]:
+def _compare_clocks(camera: CameraDevice, *, exposure_ms: float, **settings: Any) -> tuple[float, int | None]:
     """Return the offset in s from the camera's time stamps to `time.monotonic`, and the encoder count at rest."""
     offsets, encoder = [], None
+    camera.configure(exposure_ms=exposure_ms, **settings, trigger="software")
+    camera.start(faults="skip")
     for _ in range(_TRIGGERS):
         asked_s = time.monotonic()
         camera.trigger()
         frame = camera.grab(_PATIENCE_S + 1e-3 * exposure_ms)
         offsets.append(asked_s - frame.time_s)
         encoder = frame.encoder
+    camera.stop()
     # A delayed time stamp makes the difference too small, never too large.
     return max(offsets), encoder
 
@@ -231,7 +241,8 @@ class _FrameReader:
                 middle_s = frame.time_s + self._offset_s + 0.5e-3 * self._exposure_ms
                 self._pending.append((frame, middle_s))
                 self._store_located()
-                if self.end_s is not None and middle_s > self.end_s:
+                # By both clocks, as the camera's may be set.
+                if self.end_s is not None and max(middle_s, time.monotonic() - _PATIENCE_S) > self.end_s:
                     return
         except Exception as error:
             self.error = error
@@ -298,13 +309,10 @@ class _FrameReader:
             stage = at_rest[0] + continuous.mm_per_count * (counts[1:] - counts[0])
         latency_s, std_s = 1e-3 * (continuous.latency_ms or 0.0), None
         if continuous.latency_ms is None and continuous.mm_per_count is None:
-            if len(speeds) < 2:
-                warn("the latency of the stage is unknown and taken as 0: both_ways = true measures it")
-            else:
-                try:
-                    latency_s, std_s = measure_latency(centres, stage, speed)
-                except EvaluationError as error:
-                    warn(f"the latency of the stage is taken as 0: {error}")
+            try:
+                latency_s, std_s = measure_latency(centres, stage, speed)
+            except EvaluationError as error:
+                warn(f"the latency of the stage is unknown and taken as 0: {error}")
         stage = stage + speed * latency_s
         reports = [(_time_of(each) - self._began_s, each.position_mm) for one in self._passes for each in one]
         self._writer.place(stage, speed, np.array(reports))

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from scipy.optimize import minimize_scalar
 
 from uwlts.errors import CalibrationError, CaptureError, DescriptionError
 from uwlts.files.reading import log_warnings
-from uwlts.fitting.least_squares import robust_std
+from uwlts.fitting.least_squares import fit_biweight, robust_std
 from uwlts.fitting.propagation import jackknife
 from uwlts.model.calibration import Calibration, calibration_digest
 from uwlts.model.media import water_absorption_per_m
@@ -75,7 +76,6 @@ _MOST_COLOUR_PER_M, _COLOUR_PER_NM = 39.0, 0.014
 """Absorption at 380 nm beyond that of water, and its decrease. The brownest of 20 Finnish and Estonian lakes has 19.5/m
 (Sipelgas et al. 2003, Hydrology Research 34:361); twice as much leaves room for particles. At 635 nm it is 1.1/m."""
 _SIGNIFICANT = 3.0  # standard uncertainties beyond the absorption of natural water: one of 740 by chance
-_AS_DESCRIBED = np.zeros(2)
 _FAN_STD = 0.1
 """Standard uncertainty of the described power along the fan, relative, at its edges: line lasers are specified so."""
 
@@ -262,9 +262,7 @@ class _Evidence:
         def mean(values: np.ndarray) -> np.ndarray:
             return _mean_of(images.of_group[held], values[held])
 
-        def mean_of_block(values: np.ndarray) -> np.ndarray:
-            return _mean_of(images.block, values)
-
+        mean_of_block = partial(_mean_of, images.block)
         sheet, ray = mean(light.sheet_per_px), mean(light.ray_per_px)
         to_laser, to_camera = mean(light.laser_path_mm), mean(light.camera_path_mm)
         index = calibration.medium_index(header.medium)
@@ -310,9 +308,8 @@ class _Evidence:
     def estimate_with_covariance(self, attenuation_per_m: float | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return the estimates in the order of `_NAMES`, and their covariance; with a given attenuation, if any.
 
-        The covariance of the jackknife over the blocks is added to those of the described profile of the fan and of the
-        model of the halo. The latter is the change of the estimates if the tail begins at twice the distance; for the
-        scattering it is a fraction.
+        The covariance is that of the jackknife over the blocks, of the described profile of the fan, and of the model
+        of the halo: a fraction of the scattering.
         """
         every = np.ones(BLOCKS, bool)
         whole = self.estimate(every, attenuation_per_m)
@@ -321,43 +318,29 @@ class _Evidence:
         for fan in np.eye(2):
             moved = self.estimate(every, attenuation_per_m, fan=_FAN_STD * fan) - whole
             covariance += np.outer(moved, moved)
-        moved = self.estimate(every, attenuation_per_m, first_px=2 * TAIL_FIRST_PX) - whole
-        scattering = _NAMES.index("scattering_per_m")
-        moved[scattering] = math.copysign(_SCATTERING_STD * whole[scattering], moved[scattering])
-        covariance += np.outer(moved, moved)
-        radius = _NAMES.index("sheet_radius_mm")
+        scattering, radius = _NAMES.index("scattering_per_m"), _NAMES.index("sheet_radius_mm")
+        covariance[scattering, scattering] += (_SCATTERING_STD * whole[scattering]) ** 2
         wider = math.hypot(_WIDTH_STD, _WIDTH_BY_HALO * 1e-3 * self.path_mm * whole[scattering])
         covariance[radius, radius] += (wider * whole[radius]) ** 2
         return whole, covariance
 
     def estimate(
-        self,
-        kept: np.ndarray,
-        attenuation_per_m: float | None = None,
-        fan: np.ndarray = _AS_DESCRIBED,
-        first_px: int = TAIL_FIRST_PX,
+        self, kept: np.ndarray, attenuation_per_m: float | None = None, fan: Sequence[float] | np.ndarray = (0.0, 0.0)
     ) -> np.ndarray:
-        """Return the estimates from some of the blocks (BLOCKS,).
-
-        ``fan`` is the expected deviation of the fan's power from its description, odd and even part; ``first_px`` is
-        the least distance of the tail.
-        """
+        """Return the estimates from some blocks (BLOCKS,), for the fan's odd and even deviation from described."""
         images, some = self.images, kept[self.images.block]
         background, scattering = float(np.min(images.tail[kept])), 0.0
         for _ in range(_ROUNDS):
-            scattering, background = self._fit_tail(kept, background, first_px)
+            scattering, background = self._fit_tail(kept, background)
         design, bright = self._brightness(scattering, background)
-        weight, rest = _fit_robustly(design[some], bright[some])
+        rest, weight = _fit_robustly(design[some], bright[some])
         root = np.sqrt(weight)
-        # Rows for what is known: the fan's described power, and the attenuation if it is given.
-        known = np.array([[0, 0, 1, 0], [0, 0, 0, 1]]) / _FAN_STD
+        # Rows for what is known: the attenuation if it is given, and the fan's described power.
+        known = np.diag([0.0 if attenuation_per_m is None else 1e6, 1 / _FAN_STD, 1 / _FAN_STD])
         scale = max(math.sqrt(np.average(rest**2, weights=weight)), 1e-6)
-        rows = [design[some] * root[:, None] / scale, known]
-        sides = [bright[some] * root / scale, fan / _FAN_STD]
-        if attenuation_per_m is not None:
-            rows.append(np.array([[0, 1e6, 0, 0]]))
-            sides.append(np.array([1e6 * attenuation_per_m]))
-        level, attenuation, slope, curve = np.linalg.lstsq(np.vstack(rows), np.concatenate(sides), rcond=None)[0]
+        rows = np.vstack([design[some] * root[:, None] / scale, np.pad(known, ((0, 0), (1, 0)))])
+        sides = np.append(bright[some] * root / scale, known @ [attenuation_per_m or 0.0, *fan])
+        level, attenuation, slope, curve = np.linalg.lstsq(rows, sides, rcond=None)[0]
         power = math.exp(level + attenuation * 1e-3 * self.path_mm)
         sigma = np.array([fit_sigma(images.fine_px, profile) for profile in images.fine[kept]])
         radius = 2 * self.sheet_per_px[kept] * np.sqrt(np.maximum(sigma**2 - self.blur_var[kept], 0.0))
@@ -383,12 +366,12 @@ class _Evidence:
         light = _mean_of(images.block, images.light - images.width * background)
         return self.tails(scattering) * (light / self.within(scattering))[:, None]
 
-    def _fit_tail(self, kept: np.ndarray, background: float, first_px: int) -> tuple[float, float]:
+    def _fit_tail(self, kept: np.ndarray, background: float) -> tuple[float, float]:
         """Return the scattering coefficient in 1/m, and the grey value of the background, from the tails.
 
         ``background`` is a first value, for the light of the stripe.
         """
-        first = max(self.images.width // 2, first_px)
+        first = max(self.images.width // 2, TAIL_FIRST_PX)
         tail, count = self.images.tail[kept, first:], self.images.tail_count[kept, first:]
 
         def background_and_misfit(b: float) -> tuple[float, float]:
@@ -406,7 +389,7 @@ class _Evidence:
         """Judge the fit of light along the stripe, halo and background, and the absorption, for `_NAMES`."""
         value = dict(zip(_NAMES, whole.tolist(), strict=True))
         fitted = value["scattering_per_m"], value["background_dn"]
-        rest = _fit_robustly(*self._brightness(*fitted))[1]
+        rest = _fit_robustly(*self._brightness(*fitted))[0]
         # A pattern along the fan is the laser's: it repeats in all images.
         cell = np.argsort(np.argsort(self.fan)) // BLOCKS
         scatter = robust_std(rest - _mean_of(cell, rest)[cell])
@@ -472,13 +455,9 @@ def _natural_absorption(header: CaptureHeader) -> tuple[float, float]:
 
 
 def _fit_robustly(design: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return Huber's weights, by which edges, prints or scratches count less, and the residuals of a linear fit."""
-    weight, rest = np.ones(len(values)), values
-    for _ in range(6):  # the weights then change by less than a thousandth
-        root = np.sqrt(weight)
-        rest = values - design @ np.linalg.lstsq(design * root[:, None], values * root, rcond=None)[0]
-        weight = np.minimum(1.0, 1.5 * (robust_std(rest) + 1e-12) / np.maximum(np.abs(rest), 1e-12))
-    return weight, rest
+    """Return residuals and weights of a linear fit, by which edges, prints or scratches count less."""
+    rows, weight = fit_biweight(design, values, np.ones(len(values), bool))
+    return values - design @ (rows @ values), weight
 
 
 def _find_inseparable(

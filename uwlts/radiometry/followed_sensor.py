@@ -11,7 +11,6 @@ import numpy as np
 from uwlts.model.calibration import Calibration
 from uwlts.model.placement import laser_pose
 from uwlts.model.sensor import CaptureHeader, Laser, Medium, Sensor
-from uwlts.optics.brightness import sheet_sigma_mm
 from uwlts.optics.triangulation import points_on_sheet
 from uwlts.radiometry.result import ImageEstimate, Outlook
 from uwlts.radiometry.stripe_images import StripeImages
@@ -111,18 +110,13 @@ def _placement(sensor: Sensor, calibration: Calibration) -> dict[str, Any]:
 def _waist_radius_mm(laser: Laser, radius_mm: float, distance_mm: float, *, medium_index: float) -> float | None:
     """Return the waist radius at the described focus that gives a radius at a distance; None if diffraction forbids it.
 
-    Of two solutions, the one with the larger waist is returned: the wider sheet spreads less.
+    The equation of `sheet_sigma_mm` is quadratic in the squared waist. Of two solutions, the larger waist is returned:
+    the wider sheet spreads less.
     """
-    waists = np.geomspace(4 * radius_mm, 1e-3 * radius_mm, 4001)
-    radii = np.array(
-        [
-            2 * float(sheet_sigma_mm(laser.model_copy(update={"waist_radius_mm": float(waist)}),
-                                     np.array(distance_mm), medium_index=medium_index))
-            for waist in waists
-        ]
-    )  # fmt: skip
-    below = np.flatnonzero(radii <= radius_mm)
-    return float(waists[below[0]]) if radius_mm > 0 and len(below) else None
+    away_mm = distance_mm - laser.waist_distance_mm
+    spread = laser.beam_quality_m2 * 1e-6 * laser.wavelength_nm * away_mm / (math.pi * medium_index)
+    left = radius_mm**4 - 4 * spread**2
+    return math.sqrt((radius_mm**2 + math.sqrt(left)) / 2) if radius_mm > 0 and left >= 0 else None
 
 
 def _fit_medium(medium: Medium, attenuation_per_m: float, scattering_per_m: float) -> Medium:
@@ -155,12 +149,12 @@ def outlook(
     frame = calibration.object_transform()[:3, :3]
     light = light_at(sensor, calibration, pixels, np.tile(-frame[:, 2], (count, 1)), medium_index=index)
     points = points_on_sheet(calibration, pixels, medium_index=index).points_mm
-    exposure = float(np.median(images.exposure_ms))
+    exposure, paths = float(np.median(images.exposure_ms)), light.laser_path_mm + light.camera_path_mm
     attenuation = value["attenuation_per_m"]
     if not determined:
         attenuation = 1e3 * header.medium.extinction_per_mm(sensor.laser.wavelength_nm)
     power = value["power_reflectance_mw"]
-    whole = exposure * light.grey_per_mw * power * np.exp(-1e-3 * attenuation * light.path_mm())
+    whole = exposure * light.grey_per_mw * power * np.exp(-1e-3 * attenuation * paths)
     peak = whole / (math.sqrt(2 * math.pi) * math.hypot(value["stripe_sigma_px"], math.sqrt(1 / 12)))
     options = StripeOptions.resolve(sensor, None)
     noise = value.get("dark_noise_dn", sensor.detector.gain_dn_per_e() * sensor.detector.read_noise_e)

@@ -7,9 +7,11 @@ the sheet to the surface point of a pixel, per pixel. It does not depend on the 
 
 For the halo, light is scattered on the way to the surface and on the way to the camera. Let a surface point be at the
 distance x from the sheet. Along the path D before the surface, the sheet scatters the fraction b dl per length; from
-the element at l and y, the point receives p(a) / (x^2 + y^2 + l^2), with the phase function p at the angle a =
-atan(sqrt(x^2 + y^2) / l). The sum over y and l is the line spread q(x) of single scattering per b. The same function
-describes the path to the camera, with the distance from the camera ray instead of the sheet.
+the element at l and y, the point receives p(a) cos(a) / (x^2 + y^2 + l^2), with the phase function p at the angle a =
+atan(sqrt(x^2 + y^2) / l). The cosine is that of incidence, relative to that of the unscattered light; on inclined
+surfaces it is the mean of both sides of the stripe. The sum over y and l is the line spread q(x) of single scattering
+per b. The same function describes the path to the camera, with the distance from the camera ray instead of the sheet
+and the cosine of emission.
 
 Small angles add up when light is scattered several times. The Fourier transform of the whole line spread is then that
 of the unscattered stripe times exp(b Q), with the transform Q of q (Wells 1969, JOSA 59:686; Mobley, Light and Water,
@@ -74,10 +76,6 @@ class StripeLight:
     sheet_per_px: np.ndarray
     ray_per_px: np.ndarray
     fan_angle: np.ndarray  # (N,); angle of the fan ray in air divided by half the fan angle
-
-    def path_mm(self) -> np.ndarray:
-        """Return the path (N,) of the light in the medium."""
-        return self.laser_path_mm + self.camera_path_mm
 
 
 def stripe_light(
@@ -251,7 +249,7 @@ def line_spread(per_sr: Callable[[np.ndarray], np.ndarray], distance_mm: np.ndar
     along = np.geomspace(1e-2 * _LEAST_MM, path_mm, _ALONG)[:, None]
     across = np.geomspace(1e-2 * _LEAST_MM, path_mm, _ACROSS)
     aside = np.sqrt(x**2 + across**2)
-    value = per_sr(np.clip(np.arctan2(aside, along), 1e-7, np.pi - 1e-7)) / (aside**2 + along**2)
+    value = per_sr(np.clip(np.arctan2(aside, along), 1e-7, np.pi - 1e-7)) * along / np.hypot(aside, along) ** 3
     over_y = np.trapezoid(value * across, np.log(across), axis=2)
     return 2 * np.asarray(np.trapezoid(over_y * along[:, 0], np.log(along[:, 0])))
 

@@ -47,7 +47,7 @@ def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s:
     if min(len(there), len(back)) < 4:
         raise EvaluationError(
             f"found {len(there)} frames of the forward and {len(back)} of the backward pass; at least four of each are "
-            "needed"
+            "needed (both_ways = true)"
         )
     there, back = (frames[np.argsort(stage_mm[frames])] for frames in (there, back))
     surface = _Surface.from_centres(stage_mm[there], centre_px[there])

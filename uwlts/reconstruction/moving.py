@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from hashlib import sha256
 
 import numpy as np
+from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
 from uwlts.errors import CalibrationError, DescriptionError
@@ -53,6 +54,8 @@ _STOPS, _LEAST_TURN, _LIKE = 13, np.radians(30), 0.2
 """Places along the way at which course and turn are compared, least turn, and its largest relative difference."""
 _LONGEST_STEP = 10.0
 """Longest step between poses that is no gap, in medians of all steps."""
+_CLOCK_STEP, _AROUND = 3.0, 7
+"""Least step between times that is no scatter of theirs, in medians, and number of steps for the usual speed."""
 _LEAST_ACROSS = 0.1
 """Least part of the motion across the laser sheet: scans along it have no points beside each other."""
 
@@ -279,7 +282,12 @@ def _find_standstill_and_gaps(trajectory: Trajectory, times_s: np.ndarray) -> It
             "at times at which the trajectory repeats the same pose: did it freeze?"
         )
     moves = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    gaps = (steps > _LONGEST_STEP * np.median(steps)) & (moves > np.median(moves))
+    # A clock that is set adds time without motion. A platform that stops is slower before and after.
+    idle = (steps > _CLOCK_STEP * np.median(steps)) & (moves < 0.5 * median_filter(moves / steps, _AROUND) * steps)
+    if idle.any():
+        when = f"{steps[idle].max():.3g} s after {format_time(trajectory.times_s[:-1][idle][0])}"
+        yield f"the times jump by {when}, but the platform moves on: was a clock set, or did the log pause?"
+    gaps = (steps > _LONGEST_STEP * np.median(steps)) & (moves > np.median(moves)) & ~idle
     if gaps[before].any():
         yield (
             f"{np.count_nonzero(gaps[before])} of {len(times_s)} images are in gaps of the trajectory of up to "

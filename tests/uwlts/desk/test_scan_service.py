@@ -1,8 +1,10 @@
 """Scans on request: played from a capture, and recorded with a replayed camera and the twin's controller."""
 
+import math
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import Mock
@@ -21,7 +23,7 @@ from uwlts.calibration.sequential.sequential_calibration import CalibrationOptio
 from uwlts.desk import scan
 from uwlts.desk.scan import PassAdvice, ScanDevices, ScanService
 from uwlts.errors import CalibrationError, DescriptionError, HardwareError
-from uwlts.hardware.camera_interface import ReplayCamera
+from uwlts.hardware.camera_interface import Delivered, ReplayCamera
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.scan_plan import ScanPlan, load_plan
 from uwlts.model.calibration import Calibration
@@ -151,6 +153,44 @@ def test_recorded_scans_are_files_and_clouds(tmp_path, lit, calibration, control
     assert [cloud.frame[0] for cloud in clouds] == [0, 1, 2] * 2 and min(map(len, clouds)) > 1000
     times_s = [cloud.time_s[0] for cloud in clouds]
     assert times_s[0] < times_s[1] < times_s[2]
+
+
+class ReplayThatSetsClocks(LoopedReplay):
+    """Sets the computer's clock by an hour, forwards and back, and the camera's by a day, before each image."""
+
+    set_s, stamp_s = 0, 0.0
+
+    def _trigger(self) -> None:
+        self.set_s = -3600 if self.set_s > 0 else 3600
+        self.stamp_s += math.copysign(86400.0, self.set_s)
+        super()._trigger()
+
+    def _deliver(self, shown: int) -> Delivered:
+        frame = super()._deliver(shown)
+        assert frame.time_s is not None
+        return replace(frame, time_s=frame.time_s + self.stamp_s)
+
+
+def test_clocks_that_are_set_during_a_scan_change_neither_times_nor_places(
+    tmp_path, lit, calibration, controller, monkeypatch
+):
+    plan, camera, clouds, said = plan_for(tmp_path, controller, lit, count=5), ReplayThatSetsClocks(lit), [], []
+    for name, real, per_s in (("time", time.time, 1), ("time_ns", time.time_ns, 10**9)):
+        monkeypatch.setattr(time, name, lambda real=real, per_s=per_s: real() + per_s * camera.set_s)
+    with GrblStage(controller.port) as stage, camera:
+        service = ScanService(
+            plan, calibration, lambda cloud, _: clouds.append(cloud), folder=tmp_path, camera=camera, stage=stage,
+            home=True, report=said.append,
+        )  # fmt: skip
+        begun_s = time.monotonic()
+        service.start()
+        service.wait()
+        service.close()
+    with uwlts.Capture(tmp_path / "test-plate-001.h5") as capture:
+        assert len(capture) == len(clouds) == 5, said
+        np.testing.assert_allclose(capture.stage_mm, 20.0 + np.arange(5), atol=0.011)
+        times = capture.time_s
+        assert (np.diff(times) > 0).all() and times[0] >= 0 and times[-1] < time.monotonic() - begun_s
 
 
 def test_a_scan_without_a_pose_is_kept_but_gives_no_advice(tmp_path, lit, calibration, controller):

@@ -118,6 +118,21 @@ def test_images_in_a_gap_are_noticed():
 
 
 @pytest.mark.parametrize(
+    ("kind", "set_s"), [("steady", s) for s in (-2.0, -0.3, 0.3, 2.0, 3600.0)] + [("noisy", 2.0), ("noisy", 3600.0)]
+)
+def test_a_clock_that_is_set_on_the_way_is_noticed(tmp_path, kind, set_s):
+    """Between poses 0.1 s apart, with noise by two thirds of a step only a longer time."""
+    times, places, quaternions = trajectory(kind)
+    times = times + set_s * (times > 20)
+    np.savetxt(tmp_path / "a.tum", np.column_stack([times, places / 1000, quaternions]), fmt="%.9f")
+    if set_s < 0:
+        with pytest.raises(DescriptionError, match="increas"):
+            read_trajectory(tmp_path / "a.tum", pose_format="tum")
+    else:
+        assert doubts_of(times, places, quaternions)
+
+
+@pytest.mark.parametrize(
     ("shift", "names"), [(18, "UTC and GNSS"), (-37, "UTC and TAI"), (7200, "time zones"), (29, "")]
 )
 def test_the_clocks_of_time_scales_are_named(shift, names):

@@ -70,3 +70,6 @@ def test_reconstruct_says_it(dated, tmp_path):
     moved = uwlts.reconstruct(capture, path, trajectory=trajectory)
     assert any("does the platform stand still" in each for each in moved.warnings)
     assert "calibration_verified_until" in moved.metadata
+    overridden = uwlts.reconstruct(capture, path, index=1.33)
+    assert any("the verification does not apply: it had no `index`" in each for each in overridden.warnings)
+    assert "calibration_verified_until" not in overridden.metadata

@@ -15,12 +15,13 @@ import cv2
 import numpy as np
 
 from uwlts.calibration.camera.camera_parameters import DISTORTION, CameraOptions, Intrinsics, TargetImage
-from uwlts.calibration.camera.target_poses import CameraSolution, Poses, solve_camera
+from uwlts.calibration.camera.target_poses import CameraSolution, Poses, find_pose, solve_camera
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.fitting.least_squares import DEFAULT_K, MAD_TO_STD
 from uwlts.fitting.propagation import jackknife
 from uwlts.model.calibration import CameraModel
 from uwlts.model.sensor import Uncertainty
+from uwlts.optics.camera import project
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 
 _USUAL = ("k1", "k2")
@@ -122,6 +123,13 @@ class LensCalibration:
     def values(self) -> dict[str, float]:
         """Return every estimated parameter."""
         return self.solution.values()
+
+    def project(self, points: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Project points (N, 3) of the camera frame by other parameters (P,); return pixels (N, 2), else NaN."""
+        model, names = self.solution.model, self.solution.parameters
+        aspect = model.fy_px / model.fx_px if "f" in names else None
+        options = CameraOptions(tuple(name for name in names if name in DISTORTION), aspect)
+        return project(Intrinsics(options, model.width_px, model.height_px).model(values), points)
 
     def widest_deg(self) -> float:
         """Return the largest angle of a target point to the camera's axis, deg."""
@@ -364,10 +372,10 @@ def compare_models(squares: dict[CameraOptions, np.ndarray], *, least_gain: floa
 def _mean_square_miss(model: CameraModel, image: TargetImage) -> float:
     """Return the mean square distance of an image's points from their prediction, with the best-fitting pose."""
     matrix, coefficients = model.matrix(), model.coefficients()
-    found, rotation, shift = cv2.solvePnP(image.points_mm, image.pixels, matrix, coefficients)
-    if not found:
-        raise CalibrationError("no pose of the target fits one of its images")
-    rotation, shift = cv2.solvePnPRefineLM(image.points_mm, image.pixels, matrix, coefficients, rotation, shift)
+    pose = find_pose(image.points_mm, image.pixels, matrix, coefficients)
+    rotation, shift = cv2.solvePnPRefineLM(
+        image.points_mm, image.pixels, matrix, coefficients, pose[:3, None], pose[3:, None]
+    )
     seen = cv2.projectPoints(image.points_mm, rotation, shift, matrix, coefficients)[0].reshape(-1, 2)
     return float(np.mean(np.sum((image.pixels - seen) ** 2, axis=1)))
 

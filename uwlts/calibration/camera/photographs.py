@@ -31,6 +31,8 @@ from uwlts.storage.import_.grey_values import check_channel, extract_channel
 from uwlts.storage.import_.matching import image_files
 from uwlts.targets import Target, parse_target
 
+TARGET_NAME = "target.toml"
+"""Name of the target's description in the folder of photographs."""
 _FEWEST_IMAGES = 4  # three determine a lens, the fourth checks it
 
 
@@ -219,7 +221,7 @@ def _read_target(folder: Path, path: str | Path | None) -> Target:
     """Read the target from a file, or from one in the folder."""
     if not folder.is_dir():
         raise ImageError(f"no folder at {folder}")
-    known = [folder / "target.toml", folder / DESCRIPTION_NAME] if path is None else [Path(path)]
+    known = [folder / TARGET_NAME, folder / DESCRIPTION_NAME] if path is None else [Path(path)]
     there = next((each for each in known if is_regular_file(each)), None)
     if there is None:
         raise DescriptionError(

@@ -116,10 +116,17 @@ def _find_start(views: list[Placement], intrinsics: Intrinsics, poses: Poses) ->
 
 def placement_pose(placement: Placement, matrix: np.ndarray) -> np.ndarray:
     """Estimate rotation vector and shift (6,) of a placement for a camera without distortion."""
-    found, rotation, translation = cv2.solvePnP(placement.displace(), placement.pixels, matrix, None)
-    if not found:
-        raise CalibrationError("no pose of the target fits one of its images: is it the right target?")
-    return np.r_[rotation.ravel(), translation.ravel()]
+    return find_pose(placement.displace(), placement.pixels, matrix)
+
+
+def find_pose(
+    points_mm: np.ndarray, pixels: np.ndarray, matrix: np.ndarray, coefficients: np.ndarray | None = None
+) -> np.ndarray:
+    """Return rotation vector and shift (6,) from the target to a camera without a window; CalibrationError if none."""
+    found, rotation, shift = cv2.solvePnP(points_mm, pixels, matrix, coefficients)
+    if not found or not np.isfinite(shift).all():
+        raise CalibrationError("no pose of the target fits its image: is it the described target?")
+    return np.r_[rotation.ravel(), shift.ravel()]
 
 
 # Largest standard deviations relative to f and to the image's side: lengths would have the same relative errors.

@@ -11,6 +11,7 @@ from uwlts.calibration.camera.lens import LensChoice
 from uwlts.calibration.capture_evidence import (
     AirEvidence,
     StepEvidence,
+    common_sensor,
     explain_captures_without_stripe,
     find_air_evidence,
     step_evidence,
@@ -18,7 +19,7 @@ from uwlts.calibration.capture_evidence import (
 from uwlts.calibration.joint.parameters import SHEET, Prior, ViewMedium, fan_priors, window_priors
 from uwlts.calibration.joint.residuals import BENDS, SHIFT, STRETCH
 from uwlts.calibration.joint.scanned_surfaces import SLOPES
-from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, common_sensor, sources_of
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, sources_of
 from uwlts.errors import CalibrationError, DescriptionError, EvaluationError
 from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard, parse_artefact
 from uwlts.model.calibration import CameraModel, WindowModel

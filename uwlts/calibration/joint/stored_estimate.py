@@ -144,9 +144,9 @@ class StoredEstimate:
     covariance: np.ndarray
     view: ViewMedium
 
-    def project(self, points: np.ndarray) -> np.ndarray:
-        """Project points (N, 3) of the camera frame; return pixels (N, 2), else NaN."""
-        return self.parameters.project(self.values, self.view, points)
+    def project(self, points: np.ndarray, values: np.ndarray | None = None) -> np.ndarray:
+        """Project points (N, 3) of the camera frame, also by other values (P,); return pixels (N, 2), else NaN."""
+        return self.parameters.project(self.values if values is None else values, self.view, points)
 
     def triangulate(self, line: np.ndarray, centre_px: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """Return points (N, 3) of stripe centres, and derivatives (N, 3, 1 + P) by the pixel and all parameters.

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from uwlts.calibration.camera.photographs import TARGET_NAME
 from uwlts.calibration.mount.captured_profiles import CapturedProfiles, mount_covariance, reconstruct_profiles
-from uwlts.calibration.mount.hand_eye import mount_by_board
+from uwlts.calibration.mount.hand_eye import mount_by_capture, mount_by_photographs
 from uwlts.calibration.mount.next_pose import NextPose, next_pose, require_determined, weaknesses
 from uwlts.calibration.mount.profile_evidence import (
     Motion,
@@ -32,6 +33,7 @@ from uwlts.calibration.mount.restricted_likelihood import (
 )
 from uwlts.calibration.mount.start_values import NoFit, start
 from uwlts.errors import CalibrationError, DescriptionError
+from uwlts.files.reading import is_regular_file
 from uwlts.model.calibration import Calibration, rigid_transform
 from uwlts.model.mount import Mount, MountPose
 from uwlts.model.sensor import Table
@@ -70,8 +72,8 @@ def calibrate_mount(
     """Calibrate the mount of a laser profiler on a robot or stage, from its profiles of a sphere or plane.
 
     Also calibrates the mount of a calibrated sensor, from a capture of such an artefact or of a target, or the axis of
-    a rotary table. The result is ``T_platform_sensor`` with its uncertainty, the rejected poses, the weakly determined
-    directions, and the best pose to add.
+    a rotary table. A camera without a laser is calibrated from photographs. The result is ``T_platform_sensor`` with
+    its uncertainty, the rejected poses, the weakly determined directions, and the best pose to add.
 
     The platform's poses ``T_base_platform`` are known, for example from a robot's flange. A least-squares fit of the
     distances of all points from the artefact estimates the artefact's place and the mount together. The weights follow
@@ -83,8 +85,9 @@ def calibrate_mount(
     profiles
         Folder with one CSV file (columns x and z) for each pose, or one CSV file with a column pose. A cloud whose
         frames are the poses. With a calibration: a capture of the artefact, or of a target in images with the laser
-        off. Or one array for each pose in the order along the profile, mm, NaN for missing points: (N, 2) with x along
-        the profile and z, or (N, 3) with x, y, z in the sensor's frame.
+        off. A folder of photographs with target.toml, as for `uwlts.calibrate_camera`, of a camera without a laser: its
+        frame is then the sensor's. Or one array for each pose in the order along the profile, mm, NaN for missing
+        points: (N, 2) with x along the profile and z, or (N, 3) with x, y, z in the sensor's frame.
     poses
         CSV file with the pose of the platform in the base frame for each profile or target image, or
         ``T_base_platform`` (P, 4, 4), mm. Default: the poses of the capture.
@@ -136,43 +139,36 @@ def calibrate_mount(
         raise DescriptionError("`pose_format` and `pose_unit` describe a file of poses; there is none: leave them out")
     if profile_unit is not None and (calibration is not None or not isinstance(profiles, str | Path)):
         raise DescriptionError("`profile_unit` describes files of profiles; these are in mm: leave it out")
-    if calibration is not None:
+    photographs = isinstance(profiles, str | Path) and is_regular_file(Path(profiles) / TARGET_NAME)
+    if calibration is not None or photographs:
         if not isinstance(profiles, str | Path):
             raise DescriptionError("a calibration needs a capture: give the capture's path as `profiles`")
-        known = resolve_calibration(calibration)
-        if not isinstance(known, Calibration):
-            raise DescriptionError("a polynomial calibration cannot locate a target: give one with a camera model")
+        artefact = artefact_kind or radius_mm is not None or scale or time
         table, times = poses, pose_times_s
         if isinstance(poses, str | Path):
             table, times = read_poses(poses, pose_format=pose_format, unit=pose_unit)
         assert not isinstance(table, str | Path)
+        if photographs:
+            if artefact or table is None or calibration is not None:
+                raise DescriptionError("photographs of a target need poses, and nothing else but `axis`")
+            return mount_by_photographs(Path(profiles), table, axis=axis)
+        known = resolve_calibration(calibration)
+        if not isinstance(known, Calibration):
+            raise DescriptionError("a polynomial calibration cannot locate a target: give one with a camera model")
         with Capture(profiles) as capture:
             if capture.header.target is not None and not capture.laser_on.all():
-                if artefact_kind or radius_mm is not None or scale or time:
+                if artefact:
                     raise DescriptionError("the capture shows a target: give no artefact, radius, scale or time")
-                return mount_by_board(capture, known, table, axis=axis)
+                return mount_by_capture(capture, known, table, axis=axis)
             profiles = reconstruct_profiles(capture, known, table, times)
     captured = None
     if isinstance(profiles, CapturedProfiles):
         captured, poses = profiles, profiles.poses
         profiles, profile_times_s, pose_times_s = captured.profiles, captured.times_s, captured.pose_times_s
-    options: Table = {
-        "artefact": artefact_kind,
-        "radius_mm": radius_mm,
-        "pose_format": None if pose_format == "matrix" else pose_format,
-        "profile_unit": profile_unit,
-        "pose_unit": pose_unit,
-        "axis": axis,
-        "scale": scale or None,
-        "time": time or None,
-    }
-    evidence = read_mount_evidence(
-        profiles,
-        poses,
-        {name: value for name, value in options.items() if value is not None},
-        profile_times_s=profile_times_s,
-        pose_times_s=pose_times_s,
-    )
+    options: Table = {"artefact": artefact_kind or "sphere", "radius_mm": radius_mm, "scale": scale, "time": time}
+    options |= {"pose_format": pose_format, "profile_unit": profile_unit, "pose_unit": pose_unit, "axis": axis}
+    times_s = {"profile_times_s": profile_times_s, "pose_times_s": pose_times_s}
+    evidence = read_mount_evidence(profiles, poses, options, **times_s)
     try:
         return _Calibration(evidence, captured).make_result()
     except (NoFit, NotSettled) as error:

@@ -1,11 +1,12 @@
 """Profiles of a capture for a mount calibration, and propagation of the sensor's uncertainty to the mount."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from uwlts.calibration.camera.lens import LensCalibration
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, read_stored_estimate
 from uwlts.calibration.mount.restricted_likelihood import RestrictedEstimate
 from uwlts.errors import CalibrationError, DescriptionError
@@ -32,12 +33,6 @@ class CapturedProfiles:
     poses: np.ndarray
     pose_times_s: np.ndarray | None
     known: StoredEstimate | None
-
-    def select(self, numbers: Sequence[int] | np.ndarray) -> "CapturedProfiles":
-        """Return some of the profiles, each with its own pose."""
-        profiles, stripes = ([each[number] for number in numbers] for each in (self.profiles, self.stripes))
-        times = self.times_s[numbers]
-        return replace(self, profiles=profiles, stripes=stripes, times_s=times, poses=self.poses[numbers])
 
     def point_derivatives(self, number: int, rows: np.ndarray) -> np.ndarray:
         """Return derivatives (n, 3, Q) of points of a profile by the parameters of the joint estimate, sensor frame."""
@@ -87,19 +82,23 @@ def mount_covariance(
     estimate: RestrictedEstimate[Any],
     free: np.ndarray,
     rotation: np.ndarray,
-    known: StoredEstimate | None,
+    known: StoredEstimate | LensCalibration | None,
     moved: Callable[[], np.ndarray],
 ) -> tuple[np.ndarray, SensorShare | None, float]:
     """Return the covariance (K, K) of a mount estimate, the sensor's contribution, and the coverage factor.
 
     ``free`` (K, size) maps parameters to all values, ``rotation`` (3, 3) is the mount's. ``moved`` returns the
-    derivatives (G, K, Q) of the residuals by the parameters of the sensor's joint estimate ``known``. The factor is for
-    95 %.
+    derivatives (G, K, Q) of the residuals by the parameters of ``known``: the joint estimate of a sensor, or a camera.
+    The factor is for 95 %.
     """
     fitted = free @ estimate.covariance @ free.T
     covariance, share = fitted, None
     if known is not None:
-        covariance, share = _add_sensor_uncertainty(fitted, free @ estimate.propagate(moved()), rotation, known)
+        by = free @ estimate.propagate(moved())
+        if isinstance(known, StoredEstimate):
+            covariance, share = _add_sensor_uncertainty(fitted, by, rotation, known)
+        else:
+            covariance = fitted + by @ known.covariance @ by.T
     estimated = np.flatnonzero(np.diag(fitted)[:6] > 0)
     shares = (np.diag(fitted) / np.where(np.diag(covariance) > 0, np.diag(covariance), 1.0))[estimated]
     return (covariance + covariance.T) / 2, share, estimate.coverage_factor(shares, free[estimated])

@@ -7,14 +7,19 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Self
+from pathlib import Path
+from typing import Any, NamedTuple, Self
 
 import cv2
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.camera.target_poses import centre_offsets
+from uwlts.calibration.camera.camera_parameters import TargetImage
+from uwlts.calibration.camera.lens import LensCalibration
+from uwlts.calibration.camera.photographs import calibrate_camera
+from uwlts.calibration.camera.target_poses import centre_offsets, find_pose
+from uwlts.calibration.capture_evidence import detect_target
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, read_stored_estimate
 from uwlts.calibration.mount.captured_profiles import mount_covariance
 from uwlts.calibration.mount.next_pose import OPEN_RAD, describe_missing_turns, require_determined, weaknesses
@@ -25,14 +30,15 @@ from uwlts.calibration.mount.restricted_likelihood import (
     settle_agreeing,
     solve_step,
 )
-from uwlts.errors import CalibrationError, DescriptionError, TargetError
+from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.files.writing import hash_file
 from uwlts.fitting.propagation import differences
-from uwlts.model.calibration import Calibration, WindowModel, rigid_transform
+from uwlts.model.calibration import Calibration, CameraModel, WindowModel, rigid_transform
 from uwlts.model.mount import BoardFound, Mount, MountPose
 from uwlts.optics.camera import directions, project_through_window
 from uwlts.optics.fitness import check_fits
 from uwlts.optics.window import trace_window
+from uwlts.runtime.workers import map_in_threads
 from uwlts.storage.capture import Capture
 from uwlts.storage.mount_files import SENSOR_AXES, SensorAxis, require_table
 from uwlts.targets import Target, parse_target
@@ -50,12 +56,54 @@ _LEAST_MM = 1e-3  # smallest scatter of shifts to start from; no platform is bet
 _LEAST_RAD = 1e-6  # smallest scatter of rotations to start from
 
 
+class TargetCamera(NamedTuple):
+    """Calibrated camera that sees a target through window and medium; ``known`` is its estimate with covariance."""
+
+    model: CameraModel
+    window: WindowModel | None
+    index: float
+    camera_from_sensor: np.ndarray  # (4, 4); the identity for a camera without a laser
+    known: StoredEstimate | LensCalibration | None
+
+
+def mount_by_capture(
+    capture: Capture, calibration: Calibration, poses: np.ndarray | None, *, axis: SensorAxis | None
+) -> Mount:
+    """Estimate the mount of a sensor from images with the laser off; ``poses`` replace those of the capture."""
+    header = capture.header
+    check_fits(header, calibration, source=capture.path.name)
+    known = None if calibration.joint is None else read_stored_estimate(calibration, header.sensor, header.medium)
+    window = calibration.window if header.sensor.camera.window.mounted else None
+    index, from_sensor = calibration.medium_index(header.medium), calibration.object_transform()
+    target, at = parse_target(header.target or {}), capture.pose[~capture.laser_on] if poses is None else poses
+    found = map_in_threads(partial(detect_target, capture, target, 0), capture.frames(laser_on=False))
+    views = [(f"{capture.path.stem}, frame {k}", v if isinstance(v, str) else v[1]) for (k, _), v in found]
+    camera, hashes = TargetCamera(calibration.camera, window, index, from_sensor, known), hash_file(capture.path)
+    return mount_by_board(target, views, camera, at, axis=axis, inputs={capture.path.name: hashes})
+
+
+def mount_by_photographs(folder: Path, poses: np.ndarray, *, axis: SensorAxis | None) -> Mount:
+    """Calibrate the camera of photographs of a target, and estimate its mount from the same photographs."""
+    found = calibrate_camera(folder)
+    images, model = iter(found.lens.images), found.lens.solution.model
+    views = [(each.name, each.reason or next(images)) for each in found.photographs]
+    camera = TargetCamera(model, None, 1.0, np.eye(4), found.lens)
+    hashes = {each.name: hash_file(folder / each.name) for each in found.photographs}
+    return mount_by_board(found.target, views, camera, poses, axis=axis, inputs=hashes)
+
+
 def mount_by_board(
-    capture: Capture, calibration: Calibration, poses: np.ndarray | None = None, *, axis: SensorAxis | None = None
+    target: Target,
+    views: Sequence[tuple[str, TargetImage | str]],
+    camera: TargetCamera,
+    poses: np.ndarray,
+    *,
+    axis: SensorAxis | None = None,
+    inputs: dict[str, str],
 ) -> Mount:
     """Estimate ``T_platform_sensor`` from images of a target at an unknown fixed place.
 
-    The calibration of the sensor is fixed. The covariance of a joint calibration is propagated to the mount.
+    The calibration of the camera is fixed. Its covariance, if known, is propagated to the mount.
 
     Each image gives the target's pose in front of the camera, through window and medium. A closed-form solution (Park
     and Martin, IEEE Trans. Robotics and Automation 10, 1994) starts a least-squares estimate of the mount and the
@@ -63,42 +111,28 @@ def mount_by_board(
     rotation. Restricted maximum likelihood estimates this scatter, and the ratio of image errors to the noise of their
     points (for example if the target is bent). Images that contradict the others are rejected.
 
-    Parameters
-    ----------
-    capture
-        Capture that describes its target and shows it with the laser off.
-    calibration
-        Calibration of the sensor.
-    poses
-        ``T_base_platform`` (P, 4, 4) of the images with the laser off, in their order. Default: those of the capture.
-    axis
-        Set if the platform is a rotary table that turns the target, as for `uwlts.calibrate_mount`.
+    ``views`` are the images by name, or why they show no target, ``poses`` their ``T_base_platform`` (P, 4, 4).
+    ``axis`` is set if the platform is a rotary table, as for `uwlts.calibrate_mount`; ``inputs`` are hashes of files.
 
-    Raises
-    ------
-    DescriptionError
-        The capture does not describe its target, or images have no pose.
-    CalibrationError
-        Too few images show the target, or the poses do not determine the mount or contradict the images.
+    Raises DescriptionError if images have no pose, CalibrationError if too few show the target, or the poses do not
+    determine the mount or contradict the images.
     """
-    header = capture.header
-    known = None if calibration.joint is None else read_stored_estimate(calibration, header.sensor, header.medium)
-    target, images, reasons = detect_boards(capture, calibration, known, poses)
+    boards, reasons = place_boards(target, views, camera, poses)
     middle = target.points_mm.mean(axis=0)
-    rotations = Rotation.from_matrix([image.base_from_platform[:3, :3] for image in images])
+    rotations = Rotation.from_matrix([image.base_from_platform[:3, :3] for image in boards])
     if axis is not None:
-        require_table(np.array([image.base_from_platform for image in images]))
+        require_table(np.array([image.base_from_platform for image in boards]))
     elif missing := describe_missing_turns(rotations, least_rad=OPEN_RAD):
         raise CalibrationError(f"the poses do not determine the mount: {'; '.join(missing)}")
-    problem = BoardEvidence(images, calibration.object_transform(), middle, axis is not None)
+    problem = BoardEvidence(boards, camera.camera_from_sensor, middle, axis is not None)
     estimate, kept = select_agreeing_images(problem)
     used, state = problem.select(kept), estimate.state
     _, position_mm, _ = estimate.scatter
     extent = float(np.linalg.norm(np.ptp(target.points_mm, axis=0)))
-    if position_mm > _NO_FIT * extent or 2 * len(used.images) < len(images):
+    if position_mm > _NO_FIT * extent or 2 * len(used.images) < len(boards):
         raise CalibrationError(
             f"no mount fits the images: the poses would have errors of {position_mm:.3g} mm (rms), with "
-            f"{len(images) - len(used.images)} of {len(images)} images rejected. Check that the poses are "
+            f"{len(boards) - len(used.images)} of {len(boards)} images rejected. Check that the poses are "
             "T_base_platform, their format, their units, and that they are in the order of the images"
         )
     if axis is not None and state[0][2, :3] @ SENSOR_AXES[axis] <= 0:
@@ -107,23 +141,20 @@ def mount_by_board(
             f"({', '.join(f'{each:.2f}' for each in state[0][2, :3])}): check the sign of the angles"
         )
     covariance, share, factor = mount_covariance(
-        estimate, used.free, state[0][:3, :3], known, lambda: used.residual_derivatives(state)
+        estimate, used.free, state[0][:3, :3], camera.known, lambda: used.residual_derivatives(state)
     )
     weak = weaknesses(covariance[:6, :6], Rotation.from_matrix(rotations.as_matrix()[kept]), table=used.table)
     require_determined(covariance, weak)
-    found = {image.name: used.offsets_mm(state)[k] for k, image in enumerate(used.images)}
-    others = [used.apply_step(state, step) for step, _ in estimate.without_each]
-    held = {image.name: used.offsets_mm(others[k])[k] for k, image in enumerate(used.images)}
+    without = [used.apply_step(state, step) for step, _ in estimate.without_each]
+    rms, held = used.offsets_mm(state), np.array([used.offsets_mm(each)[k] for k, each in enumerate(without)])
+    found: dict[str, Any] = {
+        image.name: {"rms_mm": own, "held_out_mm": other}
+        for image, own, other in zip(used.images, rms.tolist(), held.tolist(), strict=True)
+    }
+    contradicts = {"reason": "contradicts the other images"}
     rows = [
-        MountPose(
-            name=image.name,
-            points=image.points,
-            points_left_out=0,
-            rms_mm=found.get(image.name),
-            held_out_mm=held.get(image.name),
-            reason=None if image.name in found else "contradicts the other images",
-        )
-        for image in images
+        MountPose(name=image.name, points=image.points, points_left_out=0, **found.get(image.name, contradicts))
+        for image in boards
     ] + [MountPose(name=name, points=0, points_left_out=0, reason=reason) for name, reason in reasons.items()]
     distance = float(np.median([image.camera_from_target[2, 3] for image in used.images]))
     rms_px = float(np.sqrt(np.mean([image.rms_px**2 for image in used.images])))
@@ -132,15 +163,15 @@ def mount_by_board(
         covariance=tuple(tuple(row) for row in covariance[:6, :6].tolist()),
         coverage_factor=factor,
         artefact=BoardFound(T_base_target=tuple(map(tuple, state[1].tolist()))),
-        point_std_mm=rms_px * distance / calibration.camera.fx_px,
+        point_std_mm=rms_px * distance / camera.model.fx_px,
         pose_std_mm=float(position_mm),
-        rms_mm=float(np.sqrt(np.mean(np.square(list(found.values()))))),
-        held_out_rms_mm=float(np.sqrt(np.mean(np.square(list(held.values()))))),
+        rms_mm=float(np.sqrt(np.mean(rms**2))),
+        held_out_rms_mm=float(np.sqrt(np.mean(held**2))),
         table=axis is not None,
         sensor=share,
         poses=tuple(rows),
         weaknesses=tuple(weak),
-        inputs={capture.path.name: hash_file(capture.path)},
+        inputs=inputs,
     )
 
 
@@ -163,64 +194,46 @@ class BoardImage:
     by_sensor: np.ndarray | None = None
 
 
-def detect_boards(
-    capture: Capture, calibration: Calibration, known: StoredEstimate | None, poses: np.ndarray | None
-) -> tuple[Target, list[BoardImage], dict[str, str]]:
-    """Return the target, its pose in every image that shows it, and the reasons why other images are not used."""
-    header = capture.header
-    check_fits(header, calibration, source=capture.path.name)
-    if header.target is None:
-        raise DescriptionError(f"{capture.path.name} does not describe its target")
-    target, index = parse_target(header.target), calibration.medium_index(header.medium)
-    window = calibration.window if header.sensor.camera.window.mounted else None
-    numbers = np.flatnonzero(~capture.laser_on)
-    taken, at = len(numbers), capture.pose[numbers] if poses is None else poses
-    if len(at) != taken:
-        raise DescriptionError(f"found {len(at)} poses for {taken} images with the laser off; expected one for each")
-    images: list[BoardImage] = []
+def place_boards(
+    target: Target, views: Sequence[tuple[str, TargetImage | str]], camera: TargetCamera, poses: np.ndarray
+) -> tuple[list[BoardImage], dict[str, str]]:
+    """Return the target's pose in every image that shows it, and the reasons why other images are not used."""
+    if len(poses) != len(views):
+        raise DescriptionError(f"found {len(poses)} poses for {len(views)} images: expected one for each")
+    boards: list[BoardImage] = []
     reasons: dict[str, str] = {}
-    for (frame, image), pose in zip(capture.frames(laser_on=False), at, strict=True):
-        name = f"{capture.path.stem}, frame {frame}"
+    for (name, view), pose in zip(views, poses, strict=True):
         if not np.isfinite(pose).all():
             raise DescriptionError(f"{name} has no platform pose: give a table of poses, or import the poses")
+        if isinstance(view, str):
+            reasons[name] = view
+            continue
         try:
-            images.append(estimate_board_pose(name, image, target, calibration, known, window, index, pose))
-        except (TargetError, CalibrationError) as error:
+            boards.append(estimate_board_pose(name, view, target, camera, pose))
+        except CalibrationError as error:
             reasons[name] = f"no target: {error}"
-    if len(images) < FEWEST_IMAGES:
+    if len(boards) < FEWEST_IMAGES:
         why = next(iter(reasons.values()), "there are no images with the laser off")
         raise CalibrationError(
-            f"{len(images)} of {taken} images show the target; at least {FEWEST_IMAGES} are needed ({why})"
+            f"{len(boards)} of {len(views)} images show the target; at least {FEWEST_IMAGES} are needed ({why})"
         )
-    return target, images, reasons
+    return boards, reasons
 
 
 def estimate_board_pose(
-    name: str,
-    image: np.ndarray,
-    target: Target,
-    calibration: Calibration,
-    known: StoredEstimate | None,
-    window: WindowModel | None,
-    index: float,
-    base_from_platform: np.ndarray,
+    name: str, view: TargetImage, target: Target, camera: TargetCamera, base_from_platform: np.ndarray
 ) -> BoardImage:
     """Estimate the target's pose in one image by least squares of the pixels of its points."""
-    camera, view = calibration.camera, target.detect(image)
-    if len(view.points_mm) < 6:
-        raise CalibrationError(f"{len(view.points_mm)} points found; at least 6 are needed")
-    rays = trace_window(directions(camera, view.pixels), window, medium_index=index)
+    rays = trace_window(directions(camera.model, view.pixels), camera.window, medium_index=camera.index)
     slopes = rays.directions[:, :2] / rays.directions[:, 2:]
-    good, turn, shift = cv2.solvePnP(view.points_mm, slopes, np.eye(3), None)
-    if not good or not np.isfinite(shift).all():
-        raise CalibrationError("no pose fits its points")
+    pose = find_pose(view.points_mm, slopes, np.eye(3))
     middle = target.points_mm.mean(axis=0)
-    start = rigid_transform(cv2.Rodrigues(turn)[0], shift.ravel())
+    start = rigid_transform(cv2.Rodrigues(pose[:3])[0], pose[3:])
 
     def moved(step: np.ndarray) -> np.ndarray:
         return move_about(start, middle, step)
 
-    seen_by = partial(project_through_window, camera, window, medium_index=index)
+    seen_by = partial(project_through_window, camera.model, camera.window, medium_index=camera.index)
 
     def projected(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
         return seen_by(points @ pose[:3, :3].T + pose[:3, 3])
@@ -240,7 +253,7 @@ def estimate_board_pose(
     spread = max(float(np.sqrt(np.mean(fit.fun**2) * fit.fun.size / (fit.fun.size - 6))), _LEAST_PX)
     covariance = spread**2 * np.linalg.inv(fit.jac.T @ fit.jac)
     by_sensor = None
-    if known is not None:
+    if (known := camera.known) is not None:
         # Derivative of the pose if the sensor's parameters change and the pixels do not.
         found, where = moved(fit.x), np.zeros(6)
         by_pose = differences(
@@ -248,9 +261,8 @@ def estimate_board_pose(
         )
         placed = view.points_mm @ found[:3, :3].T + found[:3, 3]
         std = np.sqrt(np.diag(known.covariance))
-        by_values = differences(
-            lambda values: known.parameters.project(values, known.view, placed), known.values, 1e-2 * std
-        )
+        values = np.array([*known.values().values()]) if isinstance(known, LensCalibration) else known.values
+        by_values = differences(partial(known.project, placed), values, 1e-2 * std)
         by_sensor = -np.linalg.lstsq(by_pose, by_values, rcond=None)[0]
     return BoardImage(name, moved(fit.x), covariance, len(pixels), spread, base_from_platform, by_sensor)
 

@@ -7,7 +7,6 @@ polynomials vary smoothly from line to line.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -16,7 +15,7 @@ from pydantic import JsonValue
 from scipy.spatial import ConvexHull
 
 from uwlts.calibration.camera.camera_parameters import TargetImage
-from uwlts.calibration.capture_evidence import AirEvidence, find_air_evidence
+from uwlts.calibration.capture_evidence import AirEvidence, common_sensor, find_air_evidence
 from uwlts.errors import CalibrationError, RangeError
 from uwlts.fitting.least_squares import DEFAULT_K, robust_std
 from uwlts.model.calibration import PolynomialCalibration
@@ -125,37 +124,23 @@ def common_header(captures: Sequence[Capture]) -> CaptureHeader:
     Raises CalibrationError if there is no capture, one has no target, the captures differ in their arrangement, or the
     stage does not move along Z.
     """
-    if not captures:
-        raise CalibrationError("no capture of a target is given: polynomials are fitted to these")
-    first = captures[0]
-
-    def arrangement(capture: Capture) -> dict[str, Any]:
-        header, camera = capture.header, capture.header.sensor.camera
-        return {
-            "image size": (camera.width_px, camera.height_px),
-            "offset_px": camera.offset_px,
-            "stripe_along": camera.stripe_along,
-            "wavelength": header.sensor.laser.wavelength_nm,
+    common_sensor(
+        captures,
+        also=lambda header: {
             "medium": header.medium,
-            "window mounted": camera.window.mounted,
+            "window": "mounted" if header.sensor.camera.window.mounted else "removed",
             "stage_direction": header.stage_direction,
-            "target": header.target,
-        }
-
+        },
+    )
     for capture in captures:
         if capture.header.target is None:
             raise CalibrationError(f"{capture.path.name} does not describe its target in its header")
-        for (name, value), other in zip(arrangement(capture).items(), arrangement(first).values(), strict=True):
-            if value != other:
-                raise CalibrationError(
-                    f"{capture.path.name} does not match {first.path.name}: {name} is {value} instead of {other}"
-                )
-    direction = first.header.stage_direction
+    direction = captures[0].header.stage_direction
     if abs(direction[2]) < _ALONG_Z:
         raise CalibrationError(
             f"the stage must move the sensor along the laser's axis (OCS Z); stage_direction is {direction}"
         )
-    return first.header
+    return captures[0].header
 
 
 def stripes_on_plate(

@@ -18,6 +18,7 @@ from uwlts.calibration.camera.target_poses import CameraSolution, Poses, refuse_
 from uwlts.calibration.capture_evidence import (
     AirEvidence,
     StepEvidence,
+    common_sensor,
     explain_captures_without_stripe,
     find_air_evidence,
     step_evidence,
@@ -342,41 +343,6 @@ def _lens_figures(lens: LensCalibration, found: AirEvidence) -> dict[str, JsonVa
         "images_left_out": len(lens.left_out),
         "image_table": table,
     }
-
-
-def common_sensor(captures: Sequence[Capture]) -> Sensor:
-    """Return the first capture's sensor.
-
-    Raises CalibrationError if another capture has other optics, or there is no capture.
-    """
-    if not captures:
-        raise CalibrationError("no capture is given: a calibration needs one of a target")
-    sensor = captures[0].header.sensor
-
-    def optics(capture: Capture) -> dict[str, object]:
-        camera, laser = capture.header.sensor.camera, capture.header.sensor.laser
-        return {
-            "image size": f"{camera.width_px} x {camera.height_px} px",
-            "image offset": camera.offset_px,
-            "stripe_along": camera.stripe_along,
-            "wavelength": f"{laser.wavelength_nm:g} nm",
-        }
-
-    for capture in captures[1:]:
-        stated, other = optics(capture), optics(captures[0])
-        differ = ", ".join(
-            f"its {name} is {stated[name]} instead of {other[name]}"
-            for name in stated
-            if stated[name] != other[name] and None not in (stated[name], other[name])
-        )
-        if differ:
-            camera = capture.header.sensor.camera
-            turned = (camera.height_px, camera.width_px) == (sensor.camera.width_px, sensor.camera.height_px)
-            raise CalibrationError(
-                f"{capture.path.name} is from another sensor than {captures[0].path.name}: {differ}"
-                + ("; the images of one are rotated by 90 deg" if turned and "size" in differ else "")
-            )
-    return sensor
 
 
 def _find_approach(air: Sequence[Capture]) -> bool:

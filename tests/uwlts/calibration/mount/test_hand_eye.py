@@ -5,14 +5,19 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import uwlts
-from tests.uwlts.joint_views import MEDIUM
 from tests.uwlts.sensor_profiles import half_way, joint_estimate, largest_parts
 from tests.virtual_sensors import scene_of
 from twin import render
-from uwlts.calibration.mount.hand_eye import BoardEvidence, BoardImage, estimate_board_pose, select_agreeing_images
+from uwlts.calibration.camera.camera_parameters import TargetImage
+from uwlts.calibration.mount.hand_eye import (
+    BoardEvidence,
+    BoardImage,
+    TargetCamera,
+    estimate_board_pose,
+    select_agreeing_images,
+)
 from uwlts.calibration.sequential.sheet_fit import object_frame
 from uwlts.errors import CalibrationError, DescriptionError
-from uwlts.model.calibration import KnownMedium
 from uwlts.model.mount import BoardFound
 from uwlts.optics.nominal import nominal
 from uwlts.storage.capture import Capture, CaptureHeader, Frame
@@ -201,18 +206,14 @@ def test_a_target_s_pose_follows_the_sensor(thesis, capture_path):
     known = joint_estimate(thesis)
     with Capture(capture_path) as capture:
         image, target = next(iter(capture.frames(laser_on=False)))[1], parse_target(capture.header.target)
+    found = target.detect(image)
+    view = TargetImage(found.points_mm, found.pixels)
 
     def posed(values):
-        changed = known.calibration.model_copy(
-            update={
-                "camera": known.parameters.camera(values),
-                "window": known.parameters.window_model(values),
-                "media": (KnownMedium(medium=MEDIUM, index=known.parameters.medium_index(values, known.view)),),
-            }
-        )
-        return estimate_board_pose(
-            "", image, target, changed, known, changed.window, changed.medium_index(MEDIUM), np.eye(4)
-        )
+        index = known.parameters.medium_index(values, known.view)
+        lens, window = known.parameters.camera(values), known.parameters.window_model(values)
+        camera = TargetCamera(lens, window, index, known.calibration.object_transform(), known)
+        return estimate_board_pose("", view, target, camera, np.eye(4))
 
     own = posed(known.values)
     middle, checked = target.points_mm.mean(axis=0), 0
