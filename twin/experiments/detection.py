@@ -173,7 +173,7 @@ def fit_signal_response(depth_mm: np.ndarray, signal_mm: np.ndarray, *, threshol
 
     last = float(depth_mm.max()) + 10 * float(np.ptp(depth_mm))  # far outside what the line was fitted to
     if freedom > 0 and np.all(np.linalg.eigvalsh(covariance) > 0) and excess(last) > 0:
-        bound = float(optimize.brentq(excess, a90, last))
+        bound = float(optimize.root_scalar(excess, bracket=(a90, last)).root)
     return Fitted(a90_mm=a90, a90_95_mm=bound, location=(threshold_mm - offset) / slope, scale=scatter / slope)
 
 

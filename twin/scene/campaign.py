@@ -342,11 +342,8 @@ def find_understated(campaign: Campaign, takes: Sequence[Take]) -> tuple[Underst
     the waist's distance have no key: residuals show them, or they change no position.
     """
     described, built = choose_sensors(campaign.sensor, campaign.as_built)
-    found = [
-        *_compare_hardware(campaign, described, built),
-        *_compare_media(campaign, takes, built),
-        *_compare_steps(campaign, takes),
-    ]
+    found = [*_compare_hardware(campaign, described, built), *_compare_media(campaign, takes, built)]
+    found += _compare_steps(campaign, takes)
     # Stated values are rounded, as 2.9 K for a half width of 5 K.
     return tuple(each for each in dict.fromkeys(found) if each.deviation > 1.02 * each.expanded)
 
