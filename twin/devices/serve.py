@@ -9,6 +9,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import count
 from typing import TYPE_CHECKING
@@ -282,6 +283,7 @@ class ServedTwin:
                 signal.signal(number, handler)
 
 
+@contextmanager
 def serve(
     scene: AnyScene,
     *,
@@ -358,9 +360,8 @@ def serve(
     if not speed_up > 0:
         raise DescriptionError(f"speed_up is {speed_up:g}; it must be positive")
     if not isinstance(motion := described.motion, Motion):
-        raise DescriptionError(
-            f"{described.title} moves on a {motion.kind}; expected a scene with a motion of the stage"
-        )
+        moves = f"{described.title} moves on a {motion.kind}"
+        raise DescriptionError(f"{moves}; expected a scene with a motion of the stage")
     _, built = choose_sensors(sensor, as_built)
     faults = [parse_fault(text) for text in fault]
     use_variant(variant)
@@ -371,12 +372,9 @@ def serve(
     # The controller moves the stage, and a frame can need any light.
     at_rest = {"lights": ("lamp", "laser") if lamp else ("laser",), "speed_mm_per_s": 0.0}
     simulator = SensorSimulator(built, replace_values(described, motion=at_rest), options)
-    settings = {
-        _STEPS_PER_MM: 1 / built.stage.resolution_mm,
-        _SPEED: 60 * built.stage.speed_mm_per_s,
-        _ACCELERATION: built.stage.acceleration_mm_per_s2,
-        _TRAVEL: built.stage.travel_mm,
-    }
+    stage = built.stage
+    settings = {_STEPS_PER_MM: 1 / stage.resolution_mm, _SPEED: 60 * stage.speed_mm_per_s}
+    settings |= {_ACCELERATION: stage.acceleration_mm_per_s2, _TRAVEL: stage.travel_mm}
     controller = GrblController(settings=settings, position_mm=track.start_mm, speed_up=speed_up)
     bench = Bench(simulator, state=controller.state, track=track, lamp=lamp)
     numbers = count(1)

@@ -11,8 +11,8 @@ from twin.scene.surfaces import FinishProperties
 from uwlts.errors import DescriptionError
 
 _MOST_VERTICES = 4_000_000  # some 300 MB in the renderer
-_RELIEF_VERTICES = 150_000  # approximate largest number on an object with relief
-_RELIEF_CELLS = 96  # of the field of a relief along each axis, of a twentieth of the correlation length or more
+_RELIEF_VERTICES = 150_000  # about the most on an object: facets of 0.5 mm on a sphere of 50 mm, or one to two pixels
+_RELIEF_CELLS = 96  # of a relief's field along each axis, 7 MB in all; its period is five correlation lengths or more
 
 
 def require_few_vertices(vertices: int, *, step_mm: float, advice: str) -> None:
