@@ -55,7 +55,7 @@ _STOPS, _LEAST_TURN, _LIKE = 13, np.radians(30), 0.2
 _LONGEST_STEP = 10.0
 """Longest step between poses that is no gap, in medians of all steps."""
 _CLOCK_STEP, _AROUND = 3.0, 7
-"""Least step between times that is no scatter of theirs, in medians, and number of steps for the usual speed."""
+"""Least step between times in medians, so that a missing pose is none, and number of steps for the usual speed."""
 _LEAST_ACROSS = 0.1
 """Least part of the motion across the laser sheet: scans along it have no points beside each other."""
 

@@ -152,6 +152,7 @@ def calibrate_mount(
             if artefact or table is None or calibration is not None:
                 raise DescriptionError("photographs of a target need poses, and nothing else but `axis`")
             return mount_by_photographs(Path(profiles), table, axis=axis)
+        assert calibration is not None
         known = resolve_calibration(calibration)
         if not isinstance(known, Calibration):
             raise DescriptionError("a polynomial calibration cannot locate a target: give one with a camera model")

@@ -61,7 +61,7 @@ class TargetCamera(NamedTuple):
 
     model: CameraModel
     window: WindowModel | None
-    index: float
+    medium_index: float
     camera_from_sensor: np.ndarray  # (4, 4); the identity for a camera without a laser
     known: StoredEstimate | LensCalibration | None
 
@@ -224,7 +224,7 @@ def estimate_board_pose(
     name: str, view: TargetImage, target: Target, camera: TargetCamera, base_from_platform: np.ndarray
 ) -> BoardImage:
     """Estimate the target's pose in one image by least squares of the pixels of its points."""
-    rays = trace_window(directions(camera.model, view.pixels), camera.window, medium_index=camera.index)
+    rays = trace_window(directions(camera.model, view.pixels), camera.window, medium_index=camera.medium_index)
     slopes = rays.directions[:, :2] / rays.directions[:, 2:]
     pose = find_pose(view.points_mm, slopes, np.eye(3))
     middle = target.points_mm.mean(axis=0)
@@ -233,7 +233,7 @@ def estimate_board_pose(
     def moved(step: np.ndarray) -> np.ndarray:
         return move_about(start, middle, step)
 
-    seen_by = partial(project_through_window, camera.model, camera.window, medium_index=camera.index)
+    seen_by = partial(project_through_window, camera.model, camera.window, medium_index=camera.medium_index)
 
     def projected(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
         return seen_by(points @ pose[:3, :3].T + pose[:3, 3])
