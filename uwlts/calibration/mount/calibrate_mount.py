@@ -148,11 +148,10 @@ def calibrate_mount(
         if isinstance(poses, str | Path):
             table, times = read_poses(poses, pose_format=pose_format, unit=pose_unit)
         assert not isinstance(table, str | Path)
-        if photographs:
+        if calibration is None or photographs:
             if artefact or table is None or calibration is not None:
                 raise DescriptionError("photographs of a target need poses, and nothing else but `axis`")
             return mount_by_photographs(Path(profiles), table, axis=axis)
-        assert calibration is not None
         known = resolve_calibration(calibration)
         if not isinstance(known, Calibration):
             raise DescriptionError("a polynomial calibration cannot locate a target: give one with a camera model")
