@@ -52,7 +52,8 @@ def record_scene(
     for beside in (truth_path(path), *([] if report is None else [trajectory_path(path)])):
         if beside.exists() and not (overwrite or resume):
             raise OutputError(f"{beside} exists already; give another name, or `overwrite` to replace it")
-    simulator, drawn = SensorSimulator(as_built or sensor, scene, options), {"seed": options.seed, "spp": options.spp}
+    simulator = SensorSimulator(as_built or sensor, scene, options)
+    drawn: Table = {"seed": options.seed, "spp": options.spp}
     # The header contains only what an operator knows: nominal values.
     header = CaptureHeader(
         name=path.stem,
@@ -81,9 +82,8 @@ def record_scene(
     known = isinstance(motion, Platform) and motion.states_covariance
     lines = simulator.peak_finder is not None
     kinds = {"centre_lines": lines, "moving": motion.stage_speed_mm_s() != 0, "covariances": known}
-    files = {"overwrite": overwrite, "resume": resume}
     with (
-        CaptureWriter(path, header, dtype=dtype, **kinds, plan=plan, **files) as writer,
+        CaptureWriter(path, header, dtype=dtype, **kinds, plan=plan, overwrite=overwrite, resume=resume) as writer,
         ThreadPoolExecutor(1) as camera,
         preserve_threads() as threads,
     ):
