@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.virtual_sensors import altered, block, clear, cropped, plate, scene_of, sensor_at
-from twin.light.image_sampling import golden_step
+from twin.light.image_sampling import PixelSampler, golden_step
 from twin.light.renderer import Renderer
 from twin.rendering_options import NONE
 
@@ -88,14 +88,14 @@ def test_wide_stripes_take_fewer_samples_where_they_are_smooth(thesis, monkeypat
     scene = scene_of(plate(), block((40.0, 6.0, 12.0), (0.0, 0.0, -6.0), reflectance=0.5))
     renderer = Renderer(sensor, clear(0.3), scene, effects=replace(NONE, defocus=True))
     rendered = 0
-    whole = Renderer._render_pixels
+    whole = PixelSampler.render
 
-    def counted(self: Renderer, *arguments: Any, spp: int, **kwargs: Any) -> np.ndarray:
+    def counted(self: PixelSampler, *arguments: Any, spp: int, **kwargs: Any) -> np.ndarray:
         nonlocal rendered
         rendered += len(arguments[2]) * spp
         return whole(self, *arguments, spp=spp, **kwargs)
 
-    monkeypatch.setattr(Renderer, "_render_pixels", counted)
+    monkeypatch.setattr(PixelSampler, "render", counted)
     image = renderer.laser_frame(sensor_at(), spp=16).irradiance()
     few, rendered = rendered, 0
     monkeypatch.setattr("twin.light.renderer._WIDE_PX", math.inf)
