@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from cyclopts import App
 from result_tables import publish, table
-from robot_campaigns import FOR_THE_MOUNT, RADIUS_MM
+from robot_campaigns import FOR_THE_MOUNT, RADIUS_MM, select_profiles
 from scipy.optimize import least_squares
 
 import uwlts
@@ -128,7 +128,7 @@ def main(folder: Path, *, write: bool = False) -> None:
         calibration = uwlts.read(path.parent / "calibration.json")
         assert isinstance(calibration, Calibration)
         robot = captured(path.parent / path.name.replace("pipe-five-sides", "robot-sphere"))
-        mount = uwlts.calibrate_mount(robot.select(np.arange(FOR_THE_MOUNT)), radius_mm=RADIUS_MM)
+        mount = uwlts.calibrate_mount(select_profiles(robot, np.arange(FOR_THE_MOUNT)), radius_mm=RADIUS_MM)
         errors.append(pipe(path, calibration, mount))
         print(path.parent.name, path.stem, *np.round(errors[-1], 3), sep="\n", flush=True)
     sizes, rows = np.abs(errors), []

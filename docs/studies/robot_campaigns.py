@@ -9,6 +9,7 @@ Sensors, their calibrations and the robot's captures of a sphere, with their tru
 """
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +48,13 @@ def errors(mount: Mount, true: np.ndarray) -> np.ndarray:
     return np.append(true[:3, 3] - found[:3, 3], turn)
 
 
+def select_profiles(captured: CapturedProfiles, numbers: np.ndarray) -> CapturedProfiles:
+    """Return some of the profiles, each with its own pose."""
+    profiles, stripes = ([each[number] for number in numbers] for each in (captured.profiles, captured.stripes))
+    times, poses = captured.times_s[numbers], captured.poses[numbers]
+    return replace(captured, profiles=profiles, stripes=stripes, times_s=times, poses=poses)
+
+
 def main(folder: Path, *, write: bool = False) -> None:
     """Print the table; with `--write`, put it into its page."""
     figures: dict[str, list[tuple[float, ...]]] = {}
@@ -63,7 +71,8 @@ def main(folder: Path, *, write: bool = False) -> None:
             reported = reconstruct_profiles(capture, calibration, None, None)
         ideal = profiles_of_poses(reported, truth.pose @ np.linalg.inv(true))
         for name, captured in {"ideal": ideal, "as reported": reported}.items():
-            first, held = (captured.select(each) for each in np.split(np.arange(len(captured.poses)), [FOR_THE_MOUNT]))
+            numbers = np.split(np.arange(len(captured.poses)), [FOR_THE_MOUNT])
+            first, held = (select_profiles(captured, each) for each in numbers)
             mount = uwlts.calibrate_mount(first, radius_mm=RADIUS_MM)
             assert isinstance(mount.artefact, SphereFound) and mount.sensor is not None
             off, centre = errors(mount, true), np.array(mount.artefact.centre_mm)

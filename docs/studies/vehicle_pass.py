@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from moving_scenes import captured, truth_of
 from result_tables import publish, table
-from robot_campaigns import FOR_THE_MOUNT, RADIUS_MM
+from robot_campaigns import FOR_THE_MOUNT, RADIUS_MM, select_profiles
 
 import uwlts
 from twin.scene.platform_kinds import Vehicle
@@ -61,7 +61,7 @@ def aligned_pass(path: Path) -> Figures:
     motion, truth = truth_of(path)
     assert isinstance(motion, Vehicle) and truth.pose is not None
     robot = captured(path.parent / path.name.replace("vehicle-pass", "robot-sphere"))
-    mount = uwlts.calibrate_mount(robot.select(np.arange(FOR_THE_MOUNT)), radius_mm=RADIUS_MM)
+    mount = uwlts.calibrate_mount(select_profiles(robot, np.arange(FOR_THE_MOUNT)), radius_mm=RADIUS_MM)
     reported = uwlts.read(trajectory_path(path))
     offset = motion.clock_offset_s
     cloud = uwlts.reconstruct(

@@ -178,10 +178,8 @@ def test_clocks_that_are_set_during_a_scan_change_neither_times_nor_places(
     for name, real, per_s in (("time", time.time, 1), ("time_ns", time.time_ns, 10**9)):
         monkeypatch.setattr(time, name, lambda real=real, per_s=per_s: real() + per_s * camera.set_s)
     with GrblStage(controller.port) as stage, camera:
-        service = ScanService(
-            plan, calibration, lambda cloud, _: clouds.append(cloud), folder=tmp_path, camera=camera, stage=stage,
-            home=True, report=said.append,
-        )  # fmt: skip
+        used = {"folder": tmp_path, "devices": ScanDevices(camera, stage, home=True)}
+        service = ScanService(plan, calibration, lambda cloud, _: clouds.append(cloud), report=said.append, **used)
         begun_s = time.monotonic()
         service.start()
         service.wait()

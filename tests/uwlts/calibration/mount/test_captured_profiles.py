@@ -123,13 +123,13 @@ def test_points_do_not_count_the_sensor_twice(known, thesis, captured, mount):
         ends = (points(known.values + sign * part, sign * by @ part[: by.shape[1]]) for sign in (1, -1))
         moved.append(np.subtract(*ends) / 2)
     expected = np.sqrt(np.sum(np.square(moved), axis=0))
-    shared = point_uncertainty(table, known.calibration, frame, line, noisy, mount_by=common)
+    shared = point_uncertainty(table, known.calibration, (frame, line, noisy), mount_by=common)
     by_patterns = np.sqrt(np.sum(shared.patterns_mm.astype(float) ** 2, axis=0))
     # Second order of the errors, and patterns of 0.05 um that are left out.
     np.testing.assert_allclose(by_patterns, expected, rtol=0.02, atol=2e-4)
     ride, base = PlatformPoses(poses, None, np.zeros(2)), points(known.values, np.zeros(6))
     together = add_platform_uncertainty(shared, base, frame, ride, mount, mount_covariance=apart).std_mm()
-    alone = point_uncertainty(table, known.calibration, frame, line, noisy, mount_by=np.zeros((6, 0)))
+    alone = point_uncertainty(table, known.calibration, (frame, line, noisy), mount_by=np.zeros((6, 0)))
     twice = add_platform_uncertainty(alone, base, frame, ride, mount).std_mm()
     # At the place of the mount's calibration, the mount compensates the change of the calibration: the sphere stays.
     assert np.median(together) < 0.5 * np.median(twice)
@@ -145,7 +145,7 @@ def test_points_do_not_count_the_sensor_twice(known, thesis, captured, mount):
     here, moved = known.calibration.object_transform(), []
     for part in CovarianceRoot.from_covariance(known.covariance).root.T:
         moved.append(np.subtract(*(points_from_true_frame(known.values + sign * part) for sign in (1, -1))) / 2)
-    described = point_uncertainty(table, known.calibration, frame, line, noisy).patterns_mm.astype(float)
+    described = point_uncertainty(table, known.calibration, (frame, line, noisy)).patterns_mm.astype(float)
     expected = np.sqrt(np.sum(np.square(moved), axis=0))
     np.testing.assert_allclose(np.sqrt(np.sum(described**2, axis=0)), expected, rtol=0.02, atol=2e-4)
 
