@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -18,7 +19,9 @@ import uwlts
 from tests.documented import PAGES, ROOT, blocks, name_of
 from tests.system.documented_runs import Page, Runner, run_page, write_small_descriptions
 from tests.system.in_process import shared_workers
+from tests.system.test_camera_command import TARGET as BOARD
 from tests.system.test_documented_hardware import PAGES_RUN as HARDWARE_PAGES
+from tests.system.test_imported_calibration import CHESSBOARD, photographs, poses
 from tests.uwlts.mount_views import RADIUS_MM, SPHERE_MM, STANDOFF_MM, profile_of, sphere_campaign
 from tests.uwlts.report.test_digital_certificate import IMPORTED, SCHEMA
 
@@ -116,9 +119,24 @@ def profiles_of_a_table(runner: Runner) -> None:
 def poses_of_a_capture(runner: Runner) -> None:
     """The robot's poses at the images of board.h5, m, as its controller prints them."""
     with uwlts.read(runner.folder / "board.h5") as capture:
-        poses = np.array([frame.pose for frame in capture])
+        write_poses(runner, np.array([frame.pose for frame in capture]))
+
+
+def write_poses(runner: Runner, poses: np.ndarray) -> None:
     turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     np.savetxt(runner.folder / "poses.csv", np.hstack([poses[:, :3, 3] / 1e3, turns]), fmt="%.12f", delimiter=",")
+
+
+def photographs_on_a_robot(runner: Runner) -> None:
+    """Photographs of a chessboard by a camera whose mount is the identity, and the robot's poses."""
+    folder, rng, at = runner.folder / "photographs", np.random.default_rng(2), []
+    folder.mkdir()
+    for number, (rotation, translation) in enumerate(poses(CHESSBOARD)):
+        cv2.imwrite(str(folder / f"board{number}.png"), photographs(CHESSBOARD, rotation, translation, rng)[0])
+        at.append(np.eye(4))
+        at[-1][:3, :3], at[-1][:3, 3] = rotation.T, -rotation.T @ translation
+    (folder / "target.toml").write_text(BOARD)
+    write_poses(runner, np.array(at))
 
 
 def trajectory_for_tum(runner: Runner) -> None:
@@ -205,6 +223,7 @@ PAGES_RUN = {
         prepare={
             "uwlts mount profiles poses.csv": profiles_of_a_robot,
             "uwlts mount board.h5": poses_of_a_capture,
+            "uwlts mount photographs": photographs_on_a_robot,
             "uwlts mount profiles angles.csv": profiles_of_a_table,
             "uwlts reconstruct scan.h5 --calibration calibration.json --mount mount.json --traj": trajectory_for_tum,
         },
