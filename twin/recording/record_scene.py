@@ -74,11 +74,11 @@ def record_scene(
             **{package: version(package) for package in ("mitsuba", "drjit", "uwlts")},
         },
     )
-    shots = list(scene.motion.shots())
-    truths: list[FrameTruth] = []
+    shots, truths = list(scene.motion.shots()), list[FrameTruth]()
     dtype = np.dtype(np.uint8 if sensor.detector.bits == 8 else np.uint16)
     # The true values must not be known to the evaluation, so the finished capture does not contain the plan.
-    plan: Table = {"scene": scene.model_dump(mode="json"), "as_built": simulator.sensor.model_dump(mode="json")} | drawn
+    built = simulator.sensor
+    plan: Table = {"scene": scene.model_dump(mode="json"), "as_built": built.model_dump(mode="json"), **drawn}
     known = isinstance(motion, Platform) and motion.states_covariance
     lines = simulator.peak_finder is not None
     kinds = {"centre_lines": lines, "moving": motion.stage_speed_mm_s() != 0, "covariances": known}
