@@ -372,9 +372,8 @@ def serve(
     # The controller moves the stage, and a frame can need any light.
     at_rest = {"lights": ("lamp", "laser") if lamp else ("laser",), "speed_mm_per_s": 0.0}
     simulator = SensorSimulator(built, replace_values(described, motion=at_rest), options)
-    stage = built.stage
-    settings = {_STEPS_PER_MM: 1 / stage.resolution_mm, _SPEED: 60 * stage.speed_mm_per_s}
-    settings |= {_ACCELERATION: stage.acceleration_mm_per_s2, _TRAVEL: stage.travel_mm}
+    settings = {_STEPS_PER_MM: 1 / built.stage.resolution_mm, _SPEED: 60 * built.stage.speed_mm_per_s}
+    settings |= {_ACCELERATION: built.stage.acceleration_mm_per_s2, _TRAVEL: built.stage.travel_mm}
     controller = GrblController(settings=settings, position_mm=track.start_mm, speed_up=speed_up)
     bench = Bench(simulator, state=controller.state, track=track, lamp=lamp)
     numbers = count(1)

@@ -14,6 +14,8 @@ if it rests on fewer walks:
 - If there are more walks, they correct the description locally by the ratio of found to predicted light. Both are
   summed under a Gaussian just wide enough for a noise below the tolerance.
 - If there are enough walks in a cell, the cell keeps the light that they found.
+
+Light that the features do not predict is therefore blurred only as far as its noise exceeds the tolerance.
 """
 
 from __future__ import annotations
@@ -21,7 +23,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import cv2
@@ -32,7 +33,7 @@ from scipy.ndimage import map_coordinates
 
 from twin.backend.arrays import Bool, Float, to_jit
 from twin.light.camera import CameraView
-from twin.light.image_sampling import NODE_SPACING_PX, combine_corners, expand_cells, find_marked
+from twin.light.image_sampling import NODE_SPACING_PX, combine_corners, find_marked
 from twin.light.walk import Walker
 from uwlts.runtime.compiled import compiled
 
@@ -99,11 +100,17 @@ class IndirectLight:
         corners of the small cells. Each shows the light that surfaces reflect to the camera if the illumination decays
         with the distance from the sheet over one of `SPREAD_MM`.
         """
+        height, width = stripe.shape
         cells, inside = self._smooth(stripe, haze, surfaces) if self._scatters else self._means()
-        image, in_stripe = _interpolate_means(cells, steep=self._scatters), np.zeros(self._lit.shape, np.float32)
-        in_stripe[self._in_stripe] = inside
-        lit, near = (expand_cells(each, *stripe.shape) for each in (self._lit, in_stripe))
-        return np.where(lit, near, image[: len(stripe), : stripe.shape[1]])
+        size = self._shape[1] * WALK_CELL_PX, self._shape[0] * WALK_CELL_PX
+        image = cv2.resize(cells.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)[:height, :width]
+        for down, right in np.ndindex(NODE_SPACING_PX, NODE_SPACING_PX):
+            row, column = (
+                NODE_SPACING_PX * each + part for each, part in zip(self._in_stripe, (down, right), strict=True)
+            )
+            there = (row < height) & (column < width)
+            image[row[there], column[there]] = inside[there]
+        return image
 
     def _smooth(
         self, stripe: np.ndarray, haze: np.ndarray, surfaces: list[np.ndarray]
@@ -173,21 +180,13 @@ def trace_walks(
         yield from walker.trace(bundle, cell, seed=seed + 1013 * part)
 
 
-def _interpolate_means(cells: np.ndarray, *, steep: bool) -> np.ndarray:
-    """Interpolate means over large cells to pixels; ``steep`` light by its logarithm, with nearly the same means."""
-    size, cells = np.multiply(cells.shape[::-1], WALK_CELL_PX).tolist(), cells.astype(np.float32)
-    expand = partial(cv2.resize, dsize=size, interpolation=cv2.INTER_LINEAR)
-    if not steep:
-        return expand(cells)
-    # Straight lines between the means of a halo are up to 8 % too bright beside the stripe.
-    image = np.exp(expand(np.log(np.maximum(cells, _TINY))))
-    return image * expand(cells / _average_cells(image, *cells.shape))
-
-
 def _mark_near_stripe(lit: np.ndarray, rows: int, columns: int) -> np.ndarray:
     """Return the mask of large cells (rows, columns) on or next to the stripe, whose small cells are ``lit``."""
-    across = np.ones(2 * (2 * _CELLS_BESIDE_STRIPE + 1,), np.uint8)
-    return cv2.dilate(_average_cells(lit, rows, columns), across) > 0
+    on_stripe = np.zeros((rows, columns), np.uint8)
+    row, column = find_marked(lit)
+    on_stripe[row * NODE_SPACING_PX // WALK_CELL_PX, column * NODE_SPACING_PX // WALK_CELL_PX] = 1
+    across = 2 * _CELLS_BESIDE_STRIPE + 1
+    return cv2.dilate(on_stripe, np.ones((across, across), np.uint8)) > 0
 
 
 def _average_cells(image: np.ndarray, rows: int, columns: int) -> np.ndarray:
@@ -257,7 +256,8 @@ class FoundLight:
 
     def light(self, kinds: range) -> np.ndarray:
         """Return the light (rows, columns) of the walks in some classes."""
-        return self._light[self._slice_of(kinds)].sum(axis=0).reshape(self.shape)
+        found = self._light[self._slice_of(kinds)]
+        return (found[0] if len(found) == 1 else found.sum(axis=0)).reshape(self.shape)
 
     def squares(self, kinds: range) -> float:
         """Return the sum of squared light of the walks in some classes."""
