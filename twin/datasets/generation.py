@@ -31,7 +31,7 @@ from twin.scene.description import Scene, Value, with_values
 from uwlts.errors import DesignError, Error
 from uwlts.files.json_files import write_model
 from uwlts.files.reading import log_warnings
-from uwlts.files.writing import hash_file, write_atomically
+from uwlts.files.writing import hash_file, write_file
 from uwlts.model.library import validate_description
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Sensor
@@ -302,8 +302,7 @@ def _write_sheet(path: Path, samples: DataSet) -> None:
     size, full = (320, round(320 * images[0].shape[0] / images[0].shape[1])), 2 ** samples.card.image["bits"] - 1
     small = [cv2.resize(np.sqrt(one / full), size, interpolation=cv2.INTER_AREA) for one in images]
     sheet = cv2.vconcat([cv2.hconcat(small[row : row + 4]) for row in (0, 4, 8)])
-    with write_atomically(path, overwrite=True) as aside:
-        aside.write_bytes(cv2.imencode(".png", (255 * sheet).astype(np.uint8))[1].tobytes())
+    write_file(path, cv2.imencode(".png", (255 * sheet).astype(np.uint8))[1].tobytes(), overwrite=True)
 
 
 @dataclass(frozen=True)

@@ -455,10 +455,8 @@ def _reduce_fields(p: SensorArrays, f: dict[str, np.ndarray], share: np.ndarray,
     per_depth = rms(f["sigma_z_mm"], inside)
     line = np.where(inside.any(axis=2), 2 * f["half_line_mm"][:, :, 0], 0.0)
     at, pose = (slice(None), middle, PLACES // 2), p.pose(np)
-    thick, needed = (
-        (p.window_thickness_mm, p.laser_window_thickness_mm),
-        windows_needed_mm(p, water_depth_m=water_depth_m),
-    )
+    needed = windows_needed_mm(p, water_depth_m=water_depth_m)
+    shares = [t / least for t, least in zip((p.window_thickness_mm, p.laser_window_thickness_mm), needed, strict=True)]
     speckle_px = p.speckle_coherence / math.sqrt(2) * p.wavelength_mm * p.working_f_number() / math.pi / p.pixel_mm
     return Figures(
         **{name: worst(name) for name in ("sigma_y_mm", "sigma_z_mm", "stripe_px", "blur_px", "centre_px")},
@@ -484,9 +482,7 @@ def _reduce_fields(p: SensorArrays, f: dict[str, np.ndarray], share: np.ndarray,
         speckle_limit_mm=one(speckle_px) * f["depth_per_px_mm"][at],
         laser_class=one(laser_class(p)),
         window_mm=one(needed[0]),
-        window_safety=one(
-            SAFETY_FACTOR * np.minimum(*((t / least) ** 2 for t, least in zip(thick, needed, strict=True)))
-        ),
+        window_safety=one(SAFETY_FACTOR * np.minimum(*shares) ** 2),
         baseline_mm=one(np.hypot(*pose.origin[:2])),
     )
 
