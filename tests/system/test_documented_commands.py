@@ -193,7 +193,6 @@ PAGES_RUN = {
         not_run=MAKE
         | {"python3 -m venv": "make does it", ".venv/bin/": "make does it", "pip install": "there is no wheel here"}
     ),
-    "docs/index.md": Page(not_run=INSTALL),
     "docs/getting-started.md": Page(not_run=MAKE | INSTALL, small_python=True, again=("twin simulate spheres",)),
     "docs/explanation/design-studies.md": Page(),
     "docs/explanation/joint-calibration.md": Page(
