@@ -26,6 +26,7 @@ import uwlts
 from docs.studies.result_tables import publish, table
 from twin.scene.description import Scene
 from uwlts.model.library import load_sensor, merge_tables, validate_description
+from uwlts.model.parameter_keys import MediumIndex
 from uwlts.model.placement import laser_pose
 from uwlts.model.sensor import Sensor
 from uwlts.recalibration.as_built import as_built
@@ -40,8 +41,8 @@ TURNED = {"0": (0.0, 0.0, 0.0), "90": (0.0, 0.0, 90.0), "180": (0.0, 0.0, 180.0)
 ROBOT_MM, ROBOT_DEG = 0.05, 0.02
 FAULTS = ("none", "scene moved", "pose scale", "warmer", "mirrored")
 CHECKED = ["fault", "checks", "doubted", "names the pass or the scale"]
-HEAD = ["passes", "campaigns", "100 mm along", "before, mm", "stated", "after, mm", "stated", "error / stated"]
-HEAD += ["within 2 stated", "doubted"]
+HEAD = ["passes", "campaigns", "100 mm along, mm; index, 1e-5", "before", "stated", "after", "stated"]
+HEAD += ["error / stated", "within 2 stated", "doubted"]
 UNCERTAINTY = {
     "window_distance_mm": 5.0,
     "window_tilt_deg": 0.3,
@@ -149,6 +150,16 @@ def draw_scene(rng: np.random.Generator, kind: int) -> list[dict[str, object]]:
             return [floor | {"position_mm": [0.0, 0.0, 40.0]}, *balls]
 
 
+def draw_campaign(seed: int) -> tuple[Sensor, np.random.Generator]:
+    """Return the sensor of a campaign with its water, as built, and the generator of what else is drawn."""
+    rng = np.random.default_rng([2026, seed])
+    sensor = describe_sensor()
+    built = draw_sensor(sensor, rng)
+    off_k = float(rng.normal(0.0, sensor.uncertainty.temperature_k))
+    media = {key: each if each.kind == "air" else each.warmer_by(off_k) for key, each in built.media.items()}
+    return built.model_copy(update={"media": media}), rng
+
+
 def passes_of(turned: bool) -> dict[str, np.ndarray]:
     """Return the nominal poses (4, 4) of the sensor in the scene's frame, by name."""
     poses = {}
@@ -167,10 +178,8 @@ def record(
 
     ``later`` passes of the same sensor see another scene. The second pass may be in ``warmer`` water, by 5 K.
     """
-    rng = np.random.default_rng([2026, seed])
     sensor = describe_sensor()
-    built = draw_sensor(sensor, rng)
-    off_k = float(rng.normal(0.0, sensor.uncertainty.temperature_k))
+    built, rng = draw_campaign(seed)
     objects, count = draw_scene(rng, seed % 5), 61
     scale = rng.normal(0.0, sensor.uncertainty.stage_scale)
     lean = np.tan(np.radians(sensor.uncertainty.stage_alignment_deg)) * rng.standard_normal(2)
@@ -188,7 +197,7 @@ def record(
         true = error @ scaled
         hot = 5.0 if warmer and number == 1 else 0.0
         whole = np.linalg.inv(true)
-        media = {key: each if each.kind == "air" else each.warmer_by(off_k + hot) for key, each in built.media.items()}
+        media = {key: each if each.kind == "air" else each.warmer_by(hot) for key, each in built.media.items()}
         position = np.linspace(-45.0, 45.0, count)
         off = scale * position + sensor.uncertainty.stage_position_mm * rng.standard_normal(count)
         table = {
@@ -252,6 +261,8 @@ def measure(captures: list[Path], found: uwlts.Calibration) -> dict[str, float]:
 def run(seed: int, folder: Path, kind: str) -> dict[str, Any]:
     """Return ``rows`` of axis, error and stated uncertainty before and after, mm, the ``doubts``, and what was found.
 
+    The row "index" is that of the water's index, times 10^5.
+
     A ``robot`` moves the shifted passes, or the turned ones (``turned robot``), but states poses with errors of 0.05 mm
     and 0.02 deg.
     """
@@ -271,6 +282,12 @@ def run(seed: int, folder: Path, kind: str) -> dict[str, Any]:
         return {"rows": [], "doubts": (f"refused: {error}",)}
     before, after = (measure(captures, each) for each in (as_built(sensor, sensor.media["water"]), found.calibration))
     rows = [(each.axis, before[each.axis], each.before_mm, after[each.axis], each.after_mm) for each in found.lengths]
+    true = draw_campaign(seed)[0].media["water"].refractive_index(sensor.laser.wavelength_nm)
+    for each in found.parameters:
+        if isinstance(each.key, MediumIndex):
+            rows.append(
+                ("index", *(1e5 * v for v in (each.before - true, each.std_before, each.after - true, each.std)))
+            )
     return {"rows": rows, "doubts": found.doubts, "calibration": found.calibration}
 
 
@@ -311,14 +328,14 @@ def is_named(fault: str, doubts: tuple[str, ...]) -> bool:
 def summarise(kind: str, results: list[dict[str, Any]]) -> list[list[str]]:
     """Return a row for each axis of a kind of campaigns."""
     cells = []
-    for axis in "YZ":
+    for axis in ("Y", "Z", "index"):
         own = np.array([row[1:] for result in results for row in result["rows"] if row[0] == axis]).reshape(-1, 4)
         rms = np.sqrt(np.mean(own**2, axis=0))
         ratio = own[:, 2] / own[:, 3]
         inside = np.mean(np.abs(ratio) < 2.0)
         doubted = sum(bool(result["doubts"]) for result in results)
         cells.append(
-            [kind, str(len(results)), axis, f"{rms[0]:.3f}", f"{rms[1]:.3f}", f"{rms[2]:.3f}", f"{rms[3]:.3f}"]
+            [kind, str(len(results)), axis, *(f"{value:.1f}" if axis == "index" else f"{value:.3f}" for value in rms)]
             + [f"{np.sqrt(np.mean(ratio**2)):.2f}", f"{100 * inside:.0f} %", f"{doubted} of {len(results)}"]
         )
     return cells
