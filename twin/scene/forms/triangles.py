@@ -161,7 +161,7 @@ def add_relief(
     lengths = np.ones(3) * own.relief_length_mm
     area = trimesh.Trimesh(vertices, faces, process=False).area
     step = max(float(lengths.min()) / 20, 2 * float(np.sqrt(area / _RELIEF_VERTICES)))
-    values, faces = trimesh.remesh.subdivide_to_size(np.hstack([vertices, *uv]), faces, step, max_iter=30)[:2]
+    values, faces = _split_edges(np.hstack([vertices, *uv]), faces, step)
     fine, cell = trimesh.Trimesh(values[:, :3], faces, process=False), step / float(lengths.min())
     # Fine and coarse waves; each field is periodic, but turned at random it does not repeat along a surface.
     height, variance, number = np.zeros(len(values)), 0.0, np.fft.fftfreq(_RELIEF_CELLS)
@@ -174,3 +174,44 @@ def add_relief(
         variance += field.var()
     height *= own.relief_mm / np.sqrt(variance)
     return fine.vertices + fine.vertex_normals * height[:, None], faces, *([values[:, 3:]] if uv else [])
+
+
+def _split_edges(values: np.ndarray, faces: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
+    """Halve edges until none exceeds ``longest``; the first three columns of ``values`` (V, K) are places.
+
+    A slender triangle, with one short edge, becomes a smaller one and a strip, which is then cut across only: halves of
+    triangles alone would stay slender, and make millions of a pipe's facets.
+    """
+    done, strips = [], np.zeros((0, 4), int)  # corners a, b, c, d: b to c and d to a are short
+    while len(faces) or len(strips):
+        ends = [np.sort(np.stack([cells, np.roll(cells, -1, axis=1)], -1).reshape(-1, 2)) for cells in (faces, strips)]
+        edges, number = np.unique(np.concatenate(ends) @ [len(values), 1], return_inverse=True)
+        first, second = np.divmod(edges, len(values))
+        long = np.linalg.norm(values[first, :3] - values[second, :3], axis=1) > longest
+        middle = np.where(long, len(values) + np.cumsum(long) - 1, -1)[number]
+        values = np.vstack([values, (values[first] + values[second])[long] / 2])
+        of_faces, of_strips = middle[: faces.size].reshape(-1, 3), middle[faces.size :].reshape(-1, 4)
+        count = np.sum(of_faces >= 0, axis=1)
+        done.append(faces[count == 0])
+        # The only long edge comes first, the only short one last.
+        turn = np.where(count == 2, np.argmin(of_faces, axis=1) + 1, np.argmax(of_faces >= 0, axis=1))
+        order = (np.arange(3) + turn[:, None]) % 3
+        corners = np.hstack([np.take_along_axis(each, order, axis=1) for each in (faces, of_faces)])
+        cells: list[tuple[np.ndarray, ...]] = []
+        a, b, c, ab, bc, ca = corners[count == 1].T
+        cells += (a, ab, c), (ab, b, c)
+        a, b, c, ab, bc, ca = corners[count == 2].T
+        cells += (ab, b, bc), (a, ab, bc, c)
+        a, b, c, ab, bc, ca = corners[count == 3].T
+        cells += (a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)
+        corners, here, there = np.hstack([strips, of_strips]), of_strips[:, 0] >= 0, of_strips[:, 2] >= 0
+        a, b, c, d, ab, _, cd, _ = corners[here & there].T
+        cells += (a, ab, cd, d), (ab, b, c, cd)
+        a, b, c, d, ab, _, cd, _ = corners[here & ~there].T
+        cells += (a, ab, d), (ab, b, c), (ab, c, d)
+        a, b, c, d, ab, _, cd, _ = corners[~here & there].T
+        cells += (a, b, cd), (b, c, cd), (a, cd, d)
+        a, b, c, d, ab, _, cd, _ = corners[~here & ~there].T
+        cells += (a, b, c), (a, c, d)
+        faces, strips = (np.concatenate([np.stack(each, 1) for each in cells if len(each) == k]) for k in (3, 4))
+    return values, np.concatenate(done)
