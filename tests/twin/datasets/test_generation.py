@@ -19,7 +19,7 @@ import webdataset
 
 import twin
 from tests.virtual_sensors import altered
-from twin.datasets.data_set import DataSetDescription, LineStatus
+from twin.datasets.data_set import DataSetDescription, LineStatus, load_description
 from twin.datasets.generation import draw_scene
 from uwlts.errors import ArgumentError, CaptureError, DescriptionError, DesignError, OutputError
 from uwlts.files.json_files import json_text
@@ -284,7 +284,10 @@ def test_memory_does_not_grow_with_the_number_of_frames(tmp_path):
     "name", ["stripe-turbid", "stripe-shiny", "stripe-tank", "pipe-inspection", "calibration-boards"]
 )
 def test_presets_are_rendered(name, tmp_path):
-    samples = twin.load_dataset(twin.dataset(name, out=tmp_path / name, scenes=1, workers=1))
+    coarse = {"camera": {"width_px": 320, "height_px": 256, "pixel_size_um": 21.2}}
+    table = load_description(name).model_dump(exclude_unset=True) | {"sensor": altered(load_sensor("thesis"), coarse)}
+    described = DataSetDescription.model_validate(table)
+    samples = twin.load_dataset(twin.dataset(described, out=tmp_path / name, scenes=1, workers=1))
     for sample in samples:
         assert sample["image"].max() > 10 or sample["info"]["exposure_ms"] > 0
         if sample["info"]["light"] == "laser":
