@@ -56,12 +56,9 @@ def characteristics_table(found: Acceptance) -> str:
     rows = []
     for each in found.characteristics:
         assert each.worst is not None
-        place = f"{each.worst.position}, {each.worst.label}"
         value, u = each.worst.value_mm, each.worst.expanded_mm
-        cells = [each.symbol, f"{value:.4f}", f"{u:.4f}", f"{each.mpe_mm:g}", f"{each.count}", place]
-        rows.append([*cells, each.probability_text(), each.decision])
-    heads = ["characteristic", "worst value, mm", "U (k = 2), mm", "MPE, mm", "measured", "at"]
-    return table([*heads, "probability of conformity", "decision"], rows)
+        rows.append([each.symbol, f"{value:.4f}", f"{u:.4f}", f"{each.mpe_mm:g}", each.decision])
+    return table(["characteristic", "worst value, mm", "U (k = 2), mm", "MPE, mm", "decision"], rows)
 
 
 def flyers_table(folder: Path) -> str:

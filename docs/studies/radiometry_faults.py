@@ -137,9 +137,9 @@ def main(seeds: int = 5, *, first: int = 500, folder: Path | None = None, write:
             states = [state for each in outcomes for state in each.states.values()]
             wrong = [NAMES[key] for key in JUDGED for each in outcomes if each.states[key] == "wrong"]
             listed = ", ".join(f"{key} {wrong.count(key)}" for key in dict.fromkeys(wrong))
-            counts = [str(states.count(state)) for state in ("said", "right", "wrong")]
+            counts = [str(states.count(state)) for state in ("right", "wrong")]
             rows.append([words, f"{said} of {seeds}", *counts, listed])
-    head = ["fault", "captures with a warning", "values not determined", "right", "wrong in silence", "which"]
+    head = ["fault", "captures with a warning", "right", "wrong in silence", "which"]
     publish({"radiometry-faults": table(head, rows)}, write=write)
 
 

@@ -93,7 +93,6 @@ class Row:
                 known = [f"{each:.0f}" if abs(each) > 100 else f"{each:.3g}" for each in limits or ()]
                 cells.append("{} ({} to {})".format(*known) if known else "nothing")
             return cells
-        cells.append(f"{self.found:.0f}" if self.found > 100 else f"{self.found:.3g}")
         for limits in (self.expected, self.stated):
             if limits is None:
                 cells.append("")
@@ -318,7 +317,7 @@ def main(*, measured: bool = False, write: bool = False) -> None:
             *etna(measured, folder),
             *gap_rows(measured, folder),
         ]
-    head = ["second half", "relative to that of the first", "relative to the stated"] if measured else []
+    head = ["relative to the first", "to the stated"] if measured else []
     head = ["set", "residual", *(head or ("expected by the first half", "expected as stated"))]
     title = "real halves, measured" if measured else "real halves, expected"
     publish({title: table(head, [row.cells() for row in rows])}, write=write)

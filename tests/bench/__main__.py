@@ -372,14 +372,13 @@ def _measure(name: str) -> list[Row]:
 
 
 def _as_markdown(rows: list[Row]) -> str:
-    """Return the rows as a table with medians and ranges."""
+    """Return the rows as a table with medians."""
     cells = []
     for row in rows:
-        low, high = row.range or (row.value, row.value)
-        numbers = f"{_figures(row.value)} {row.unit}", f"{_figures(low)} to {_figures(high)}", f"{row.limit:,g}"
+        numbers = f"{_figures(row.value)} {row.unit}", f"{row.limit:,g}"
         ratio = "" if row.floor is None else f"{row.ratio:.3g} (at most {row.floor.most:g})"
         cells.append([row.name, *numbers, ratio, "" if row.ok else "missed"])
-    return result_tables.table(["what", "median", "range", "limit", "times a plain computation", ""], cells)
+    return result_tables.table(["what", "median", "limit", "times a plain computation", ""], cells)
 
 
 def _figures(value: float) -> str:

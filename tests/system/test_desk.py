@@ -442,8 +442,6 @@ def test_laser_off_works_in_every_state_of_the_page(desk, sized, served):
     for name in TABS:
         tab(page, name)
         off.works(f"tab-{name}")
-    if page.viewport_size["width"] <= 600:
-        press(page, "cloud")
     page.get_by_label("colour").click()
     page.get_by_role("option", name="intensity").wait_for()
     off.works("choice")

@@ -14,7 +14,6 @@ from tests.system.test_desk import (
     TABS,
     LaserOff,
     desk,
-    page,
     press,
     says,
     served,
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
 
     from twin.devices.serve import ServedTwin
 
-__all__ = ["DESCRIPTIONS", "desk", "page", "served", "sized"]
+__all__ = ["DESCRIPTIONS", "desk", "served", "sized"]
 
 pytestmark = pytest.mark.slow
 
@@ -76,28 +75,6 @@ def test_controls_are_in_sight_and_large_enough_for_a_finger(desk, sized):
             assert bottom <= page.viewport_size["height"], (name, label)
             checked += 1
     assert checked > 60
-    # A phone has one of both panes, over its whole width, and nothing lies on the cloud.
-    seen = [page.locator(f"section.{name}").is_visible() for name in ("image", "cloud")]
-    if page.viewport_size["width"] <= 600:
-        assert seen == [False, True]
-        canvas = page.locator(".cloud-view canvas").first.bounding_box()
-        assert canvas and canvas["x"] >= parts["axes"][2] and canvas["x"] + canvas["width"] <= parts["legend"][0]
-        press(page, "image")
-        page.locator("section.image").wait_for()
-        seen = [page.locator("section.cloud").is_hidden()] * 2
-    assert all(seen)
-
-
-def test_a_plan_that_changes_on_disk_is_read_again(desk, page):
-    plan = desk.folder / "plan.toml"
-    before = plan.read_text()
-    plan.write_text(before.replace("step_mm = 1.5", "step_mm = 2.5"))
-    says(page, "plan.toml has changed, and is read again")
-    tab(page, "Scan")
-    page.wait_for_function("document.querySelector('[aria-label=\"step, mm\"]').value === '2.5000'")
-    # A plan with an error is not used in silence.
-    plan.write_text(before.replace("step_mm", "stap_mm"))
-    says(page, "stap_mm")
 
 
 def focused(page: "Page") -> str:

@@ -282,9 +282,7 @@ def measure_position(
         low, high = np.array(position.region_mm).T
         inside = ((points >= low) & (points <= high)).all(axis=1)
         points, frame = points[inside], frame[inside]
-    margin, form_mm = plan.margin_mm(artefact), artefact.stated_form_mm()
-    # Expanded (k = 2) sqrt((F / 2)² + u(F)²): half the artefact's form, and its uncertainty (ISO/TS 23165).
-    form = None if form_mm is None else COVERAGE_FACTOR * float(np.hypot(form_mm / 2, artefact.form_uncertainty_mm / 2))
+    margin, form = plan.margin_mm(artefact), _form_expanded_mm(artefact)
     values: list[CharacteristicValue] = []
 
     def add(
@@ -382,6 +380,15 @@ def _probability(value: CharacteristicValue, limit_mm: float | None) -> float | 
         return None
     std = value.expanded_mm / COVERAGE_FACTOR
     return float(ndtr((limit_mm - value.value_mm) / std) - ndtr((-limit_mm - value.value_mm) / std))
+
+
+def _form_expanded_mm(artefact: CertifiedArtefact) -> float | None:
+    """Return the test value uncertainty (k = 2) of a form error: half the artefact's form, and its uncertainty.
+
+    The standard uncertainty is sqrt((F / 2)² + u(F)²) (ISO/TS 23165, probing error).
+    """
+    form = artefact.stated_form_mm()
+    return None if form is None else COVERAGE_FACTOR * float(np.hypot(form / 2, artefact.form_uncertainty_mm / 2))
 
 
 def _size_expanded_mm(

@@ -43,8 +43,7 @@ def stripe_on_target(
     Parameters and errors are those of `extract_stripe`.
     """
     stripe = find_stripe(seen, stripe_along=stripe_along, saturation=saturation, options=options)
-    pixels, to_plate = stripe.pixels(), np.linalg.inv(cv2.findHomography(view.points_mm[:, :2], view.pixels)[0])
-    to_plate *= np.sign(to_plate[2] @ [*view.pixels[0], 1.0])  # the third coordinate is positive on the plate
+    to_plate, pixels = _find_homography(view), stripe.pixels()
     on_plate = _mask_plate(pixels, to_plate, target)
     lines = stripe.lines[on_plate]
     across = stripe.centre_px[lines]
@@ -75,6 +74,12 @@ def stripe_on_target(
 def _pixels(lines: np.ndarray, across: np.ndarray, stripe_along: str) -> np.ndarray:
     """Return image coordinates (N, 2) of positions on profile lines."""
     return np.column_stack((across, lines) if stripe_along == "height" else (lines, across)).astype(np.float64)
+
+
+def _find_homography(view: TargetView) -> np.ndarray:
+    """Return the homography (3, 3) from pixels to the target's plane; its third coordinate is positive on the plate."""
+    inverse = np.linalg.inv(cv2.findHomography(view.points_mm[:, :2], view.pixels)[0])
+    return inverse * np.sign(inverse[2] @ [*view.pixels[0], 1.0])
 
 
 def _mask_plate(pixels: np.ndarray, to_plate: np.ndarray, target: Target) -> np.ndarray:

@@ -40,7 +40,6 @@ _MOST_SHOWN = 300_000  # points, fluent on a tablet
 _MOST_OPENED = 5_000_000  # points of a file that are kept in memory for measurements
 _JOGS_MM = (-10.0, -1.0, -0.1, 0.1, 1.0, 10.0)  # steps of the buttons that move the stage
 _FREE = (InstrumentState.READY, InstrumentState.LOCKED)
-_IDLE = (InstrumentState.DISCONNECTED, *_FREE)
 _RUNNING = (InstrumentState.SCANNING, InstrumentState.PAUSED)
 
 
@@ -205,8 +204,6 @@ class _OperatorPage:
         view = self._view
         view.header()
         with ui.element("main").classes("desk"):
-            # On a phone one of both is seen.
-            self._pane = ui.toggle(["image", "cloud"], value="cloud").classes("panes")
             view.image()
             view.cloud()
             with ui.element("section").classes("tools").props('aria-label="controls"'):
@@ -274,12 +271,13 @@ class _OperatorPage:
         chosen = None if self._desk.plan_path is None else str(self._desk.plan_path)
         # Here and below, values are passed to the constructors: a value set later reaches the browser as a message, and
         # could overwrite what the operator has typed by then.
-        camera, stage = (plan.camera or "", plan.stage.port or "") if plan else ("", "")
+        camera, stage = _addresses(plan) if plan else ("", "")
         self._plan = ui.select(plans, label="plan of the scan", value=chosen, on_change=self._choose).classes("w-full")
-        self._camera = ui.input("camera", value=camera, placeholder="gige:NAME, replay:FILE").classes("w-full")
+        kinds = "gige:NAME, replay:FILE"
+        self._camera = ui.input("camera", value=camera, placeholder=kinds).classes("w-full")
         self._stage = ui.input("stage", value=stage, placeholder="/dev/ttyACM0; empty: none").classes("w-full")
         with ui.row():
-            self._button("connect", self._connect, _IDLE)
+            self._button("connect", self._connect, (InstrumentState.DISCONNECTED, *_FREE))
             self._button("disconnect", partial(ask, device.disconnect), _FREE).props("outline")
         ui.separator()
         ui.label("live image").classes("text-sm")
@@ -294,21 +292,15 @@ class _OperatorPage:
         ui.label("The laser is on only while an image is exposed.").classes("text-xs")
 
     def _choose(self) -> None:
-        """Take the chosen plan, again if its file has changed."""
-        if not self._plan.value:
+        if not self._plan.value or Path(self._plan.value) == self._desk.plan_path:
             return
-        path = Path(self._plan.value)
         try:
-            plan = load_plan(path)
+            plan = load_plan(Path(self._plan.value))
         except Error as error:
-            self._desk.plan = None
-            return self._board.say(str(error), "error")
-        if path == self._desk.plan_path:
-            if plan == self._desk.plan:
-                return
-            self._board.say(f"{path.name} has changed, and is read again", "warning")
-        self._desk.plan_path, self._desk.plan = path, plan
-        self._camera.value, self._stage.value = plan.camera or "", plan.stage.port or ""
+            self._board.say(str(error), "error")
+            return
+        self._desk.plan_path, self._desk.plan = Path(self._plan.value), plan
+        self._camera.value, self._stage.value = _addresses(plan)
         stage = plan.stage
         self._start.value, self._step.value, self._number.value = stage.start_mm, stage.step_mm, stage.count
 
@@ -320,17 +312,16 @@ class _OperatorPage:
     def _connect(self) -> None:
         addresses = {"camera": self._camera.value or "", "stage": self._stage.value or None}
         self._instrument.ask(self._instrument.connect, self._require_plan(), **addresses)
-        self._pane.set_value("image")
 
     def _look(self, light: str) -> None:
         wanted = None if light == "none" else "laser" if light == "laser" else "lamp"
         # The toggle follows the instrument, too.
         if wanted != self._instrument.light:
             self._instrument.show_light(wanted)
-            self._pane.set_value("image")
 
     def _exposure_now(self) -> tuple[str | None, float]:
-        return (light := self._instrument.light), self._instrument.exposure_ms[light or "lamp"]
+        light = self._instrument.light
+        return light, self._instrument.exposure_ms[light or "lamp"]
 
     def _expose(self) -> None:
         light, value = self._instrument.light, self._exposure.value
@@ -365,8 +356,10 @@ class _OperatorPage:
             self._calibration_name = ui.input("name of the calibration", value="calibration")
             self._replace = ui.checkbox("replace existing")
         with ui.row():
-            self._button("begin", lambda: self._calibrate(resume=False), _IDLE)
-            self._button("continue it", lambda: self._calibrate(resume=True), _IDLE).props("outline")
+            self._button("begin", lambda: self._calibrate(resume=False), (InstrumentState.DISCONNECTED, *_FREE))
+            self._button(
+                "continue it", lambda: self._calibrate(resume=True), (InstrumentState.DISCONNECTED, *_FREE)
+            ).props("outline")
         self._show_request = answer_buttons(self._board, self._instrument.answer)
         self._button("stop", self._instrument.stop, (InstrumentState.BUSY,)).props("color=warning")
         self._view.coverage()
@@ -384,7 +377,8 @@ class _OperatorPage:
     # Scan
 
     def _scan_part(self) -> None:
-        stage = self._desk.plan and self._desk.plan.stage
+        plan = self._desk.plan
+        stage = None if plan is None else plan.stage
         start, step, count = (None, None, None) if stage is None else (stage.start_mm, stage.step_mm, stage.count)
         with ui.element("div").classes("fields"):
             self._start = NumberField("first position, mm", value=start, format="%.3f")
@@ -465,10 +459,8 @@ class _OperatorPage:
         self._files = known
         calibrations = [file.name for file in files if file.kind == "calibration"]
         self._calibration.set_options(calibrations, value=self._calibration.value)
-        self._choose()
         for choice, load in ((self._plan, load_plan), (self._guided_plan, load_guided_plan)):
-            plans = self._desk.plans(load)
-            choice.set_options(plans, value=choice.value if choice.value in plans else None)
+            choice.set_options(self._desk.plans(load), value=choice.value)
         self._analyses.set_files()
         self._rows.clear()
         with self._rows:
@@ -492,7 +484,6 @@ class _OperatorPage:
 
     async def _show(self, name: str) -> None:
         await asyncio.to_thread(self._desk.open_cloud, name)
-        self._pane.set_value("cloud")
         self._view.mark([])
 
     async def _about(self, name: str) -> None:
@@ -510,3 +501,8 @@ class _OperatorPage:
         self._desk.analyses.start("reconstruct", {"capture": name, "calibration": known}, name="", overwrite=False)
         # Progress and result are there.
         self._tabs.set_value("Inspect")
+
+
+def _addresses(plan: ScanPlan) -> tuple[str, str]:
+    """Return the addresses of the camera and the stage."""
+    return plan.camera or "", plan.stage.port or ""

@@ -284,11 +284,7 @@ class CircleGridTarget(Target):
                 f"found {most} of {self.columns} x {self.rows} circles, which fit the grid at several places: without "
                 "marks, all its sides must be in view"
             )
-
-        def step_px(indices: np.ndarray) -> float:  # mean step in the image to the right from a column to the next
-            return float(np.linalg.lstsq(np.column_stack([indices, np.ones(len(indices))]), centres)[0][0, 0])
-
-        return max((places[0] for places in best), key=step_px)
+        return max((places[0] for places in best), key=lambda indices: _direction(indices, centres))
 
 
 def _mask(places: np.ndarray) -> np.ndarray:
@@ -296,3 +292,8 @@ def _mask(places: np.ndarray) -> np.ndarray:
     mask = np.zeros(places.max(axis=0) + 1)
     mask[tuple(places.T)] = 1.0
     return mask
+
+
+def _direction(indices: np.ndarray, centres: np.ndarray) -> float:
+    """Return the mean step in the image to the right, px, from a column to the next."""
+    return float(np.linalg.lstsq(np.column_stack([indices, np.ones(len(indices))]), centres, rcond=None)[0][0, 0])

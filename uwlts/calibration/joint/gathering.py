@@ -148,10 +148,7 @@ def gather_jointly(
         found = find_air_evidence(captures, stripe=options.stripe, progress=progress)
         warnings += found.warnings
         directions = [capture.header.stage_direction for capture in captures]
-        # True if the stage moves the sensor towards the target, None if it does not move along the Z of the OCS.
-        z = [float(each[2]) for each in directions]
-        approaches = min(z) > 0 if min(map(abs, z)) >= 0.9 and min(z) * max(z) > 0 else None
-        series.append(Series(view, found, approaches, directions))
+        series.append(Series(view, found, _find_approach(captures), directions))
     for capture in steps:
         view, index = _identify_view(capture, media), options.medium_index
         found_steps, left_out = step_evidence([capture], medium_index=index, stripe=options.stripe, progress=progress)
@@ -218,6 +215,12 @@ def _identify_view(capture: Capture, media: dict[str, Medium], name: str | None 
     if media.setdefault(name, header.medium) != header.medium:
         raise CalibrationError(f"the captures use '{name}' for different media: {media[name]} and {header.medium}")
     return ViewMedium(window, list(media).index(name))
+
+
+def _find_approach(captures: Sequence[Capture]) -> bool | None:
+    """Return whether the stage moves the sensor towards the target; None if it does not move along the OCS's Z."""
+    along = {float(capture.header.stage_direction[2]) for capture in captures}
+    return min(along) > 0 if min(map(abs, along)) >= 0.9 and min(along) * max(along) > 0 else None
 
 
 def build_priors(
