@@ -54,21 +54,10 @@ class DeskServer:
     controls. ``warning`` is a warning to report if other machines can reach the page, else None. ``app`` is the
     application, for further routes.
 
-    Parameters
-    ----------
-    board : Board
-        Content of the page.
-    build : callable, optional
-        Function of the board and of whether the page is for the operator, which builds the page.
-    host, port
-        Address to serve at.
-    switch : LaserSwitch, optional
-        Switch with a button on the operator's page; its process listens at the next free port after the page's.
+    ``build``, a function of the board and of whether the page is for the operator, builds the page at ``host`` and
+    ``port``. ``switch`` is a switch with a button on the operator's page; its process listens at the next free port.
 
-    Raises
-    ------
-    SetupError
-        No port is free, the address is not one of this machine, or this process already serves a page.
+    SetupError if no port is free, the address is not one of this machine, or this process already serves a page.
     """
 
     def __init__(

@@ -23,7 +23,7 @@ from uwlts.model.parameter_keys import StageParameter
 from uwlts.model.sensor import Sensor
 from uwlts.optics.brightness import BLUR_STD, brightness_shift_std
 from uwlts.optics.line_table import LineTable, sum_terms
-from uwlts.reconstruction.moving import principal_components
+from uwlts.reconstruction.moving import ErrorPatterns, principal_components
 from uwlts.runtime.compiled import compiled
 from uwlts.storage.capture import Capture, CaptureHeader, FrameTable, sensor_poses
 from uwlts.storage.cloud import WATER, PointUncertainty
@@ -127,6 +127,7 @@ def point_uncertainty(
     beside_mm: np.ndarray | None = None,
     mount_by: np.ndarray | None = None,
     digest: str | None = None,
+    chosen: ErrorPatterns | None = None,
 ) -> PointUncertainty:
     """Calculate the uncertainty of points from stripe centres (N,) and a joint calibration.
 
@@ -141,7 +142,8 @@ def point_uncertainty(
     ``mount_by`` (6, P) are the derivatives of a calibrated mount by the parameters of the joint estimate
     (`uwlts.model.mount.SensorShare`), for frames with poses of a platform. They correlate the errors of points and
     mount. By default poses and described mount, or the stage, place the true OCS, from which the calibrated one differs
-    by the errors of camera axis and sheet. ``digest`` is that of the calibration, if known.
+    by the errors of camera axis and sheet. ``digest`` is that of the calibration, if known. Parts of one cloud have the
+    patterns ``chosen`` in common.
 
     CalibrationError if the calibration has no joint estimate, or cannot reconstruct the points.
     """
@@ -196,9 +198,12 @@ def point_uncertainty(
         return random, sums
 
     # Patterns are smooth over the points, so that a sample determines the principal ones.
-    few = slice(None, None, max(1, len(line) // _SAMPLED))
-    sampled = moved(few, np.eye(2 + len(by_stage)))[1]
-    weights = principal_components(sampled, left_mm=_NEGLIGIBLE_MM)
+    chosen = ErrorPatterns() if chosen is None else chosen
+    if chosen.of_sensor is None:
+        few = slice(None, None, max(1, len(line) // _SAMPLED))
+        sampled = moved(few, np.eye(2 + len(by_stage)))[1]
+        chosen.of_sensor = principal_components(sampled, left_mm=_NEGLIGIBLE_MM)
+    weights = chosen.of_sensor
     random, patterns = moved(slice(None), weights)
     if not np.isfinite(random).all():
         raise CalibrationError("the calibration's joint estimate gives no point for some stripe centre")

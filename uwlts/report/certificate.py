@@ -105,22 +105,8 @@ def read_certificate(path: str | Path) -> dict[str, JsonValue]:
 def check_certificate(path: str | Path, calibration: str | Path) -> list[str]:
     """Check a certificate's seal and that it belongs to a calibration file; return the problems found.
 
-    Parameters
-    ----------
-    path : str or Path
-        Certificate (JSON) to verify.
-    calibration : str or Path
-        The certified calibration file.
-
-    Returns
-    -------
-    list of str
-        Sentences about each problem; empty if the certificate is genuine and belongs to the file.
-
-    Raises
-    ------
-    CaptureError
-        A file cannot be read, or is not a certificate.
+    ``path`` is the certificate (JSON). A problem is a sentence; there is none if the certificate is genuine and belongs
+    to the file. CaptureError if a file cannot be read, or is not a certificate.
     """
     content, found = read_certificate(path), hash_file(calibration)
     against = []

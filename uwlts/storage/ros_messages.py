@@ -217,21 +217,12 @@ def read_bag_poses(path: Path, wanted: str = "") -> tuple[np.ndarray, np.ndarray
 
     Also returns covariances (N, 6, 6) in m and rad about fixed axes if every message states one, else None.
 
-    Parameters
-    ----------
-    path : Path
-        The bag.
-    wanted : str
-        Topic of messages Odometry, PoseStamped, PoseWithCovarianceStamped or TransformStamped; or ``PARENT>CHILD`` for
-        the transforms of frame CHILD in frame PARENT among all messages of type TFMessage. Optional if the bag has one
-        such topic, or none and the transforms of one pair of frames.
+    ``wanted`` is the topic of messages Odometry, PoseStamped, PoseWithCovarianceStamped or TransformStamped; or
+    ``PARENT>CHILD`` for the transforms of frame CHILD in frame PARENT among all messages of type TFMessage. Optional if
+    the bag has one such topic, or none and the transforms of one pair of frames.
 
-    Raises
-    ------
-    DescriptionError
-        The path is not a bag, or the wanted poses are missing; the message names those in the bag.
-    SetupError
-        The library for bags is not installed.
+    DescriptionError if the path is no bag, or lacks these poses; the message names those in it. SetupError without the
+    library for bags.
     """
     with open_bag(path, error=DescriptionError) as bag:
         covariances: list[np.ndarray] = []

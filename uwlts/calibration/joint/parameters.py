@@ -70,12 +70,7 @@ class EarlierEstimate:
     """Earlier estimate of the first K parameters of a vector: ``values`` (K,), ``covariance`` (K, K).
 
     ``whitening`` (K, K) is W with W^T W the inverse of the covariance: W (x - values) are K independent residuals with
-    unit variance.
-
-    Raises
-    ------
-    CalibrationError
-        The covariance is not positive definite.
+    unit variance. CalibrationError if the covariance is not positive definite.
     """
 
     values: np.ndarray
