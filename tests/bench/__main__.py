@@ -259,6 +259,17 @@ def datasets() -> list[Row]:
     ]
 
 
+def streams() -> list[Row]:
+    """Memory of long rides: profiles of 640 lines with a path, from 2,000 to 10,000."""
+    from tests.bench.streams import stream_memory
+
+    peak_gb, growth_kb = stream_memory(2000, 10000)
+    return [
+        at_most("10,000 profiles of a vehicle reconstructed with covariance: peak memory", peak_gb, "GB", 4),
+        at_most("the same: growth of the memory", growth_kb, "kB/profile", 30),
+    ]
+
+
 def hardware() -> list[Row]:
     """Frames per second from a camera to the disk, alone and with stripe and points found meanwhile."""
     from tests.bench.floors import plain_centroid_seconds, stored_image_seconds
@@ -316,7 +327,7 @@ def commands() -> list[Row]:
     ]
 
 
-_ALL = (demo, reproduction, rendering, light, campaign, pipeline, studies, datasets, hardware, commands)
+_ALL = (demo, reproduction, rendering, light, campaign, pipeline, studies, datasets, streams, hardware, commands)
 SECTIONS = {section.__name__: section for section in _ALL}
 
 

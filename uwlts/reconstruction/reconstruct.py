@@ -22,14 +22,7 @@ from uwlts.optics.brightness import IlluminatedPoints, fit_brightness_slopes, fo
 from uwlts.optics.fitness import check_fits
 from uwlts.optics.triangulation import MeasuredPoints, reconstruct_by_polynomials, reconstruct_profile, stage_travel
 from uwlts.optics.window import RayStatus, require_index
-from uwlts.reconstruction.moving import (
-    ErrorPatterns,
-    PlatformPoses,
-    add_platform_poses,
-    add_platform_uncertainty,
-    find_platform_poses,
-    sample_indices,
-)
+from uwlts.reconstruction.moving import ErrorPatterns, add_platform_poses, add_platform_uncertainty, find_platform_poses
 from uwlts.reconstruction.point_uncertainty import MOST_CORRELATED, measure_correlation, point_uncertainty
 from uwlts.runtime.compiled import compiled
 from uwlts.runtime.progress import ProgressListener, ignore_progress
@@ -143,22 +136,19 @@ def reconstruct(
         check_fits(scan.header, calibration, source=scan.path.name)
         known = calibration.joint is not None if with_uncertainty is None else with_uncertainty
         alone = scan.header.T_platform_sensor is None and scan.pose_covariance is None
-        ride: PlatformPoses | None = None
-        table, independent, common = scan, None, None
-        if alone and mount is None and trajectory is None and clock_offset_s is None and not clock_drift_ppm:
+        plain = alone and mount is None and trajectory is None and clock_offset_s is None and not clock_drift_ppm
+        if plain:
             _refuse_free_poses(scan)
-        else:
-            mount = read_mount(mount) if isinstance(mount, str | Path) else mount
-            if isinstance(trajectory, str | Path):
-                trajectory = read_trajectory(trajectory, pose_format=pose_format, unit=pose_unit)
-            ride = find_platform_poses(
-                scan, trajectory, mount=mount, clock_offset_s=clock_offset_s, clock_drift_ppm=clock_drift_ppm
-            )
-            table = add_platform_poses(scan, ride, mount)
-            if mount is not None:
-                independent, common = mount.independent_covariance(calibration_digest(calibration))
-                # The covariance of the mount of another calibration contains the errors of the OCS.
-                common = np.zeros((6, 0)) if common is None else common
+        mount = read_mount(mount) if isinstance(mount, str | Path) else mount
+        if isinstance(trajectory, str | Path):
+            trajectory = read_trajectory(trajectory, pose_format=pose_format, unit=pose_unit)
+        clock = {"clock_offset_s": clock_offset_s, "clock_drift_ppm": clock_drift_ppm}
+        ride = None if plain else find_platform_poses(scan, trajectory, mount=mount, **clock)
+        table, independent, common = scan if ride is None else add_platform_poses(scan, ride, mount), None, None
+        if mount is not None:
+            independent, common = mount.independent_covariance(calibration_digest(calibration))
+            # The covariance of the mount of another calibration contains the errors of the OCS.
+            common = np.zeros((6, 0)) if common is None else common
         chosen = ErrorPatterns()
 
         def measure(stripes: CaptureStripes) -> PointCloud:
@@ -179,12 +169,11 @@ def reconstruct(
             return replace(cloud, warnings=[*doubts, *ride.doubts, *warnings], **new)
 
         images, most = np.flatnonzero(scan.laser_on), math.inf
-        if take is not None and np.isfinite(table.pose[images]).all():
-            most = _PART if len(images) * scan.header.sensor.camera.lines() >= 2 * _PART else math.inf
-        if most < math.inf:
+        large = len(images) * scan.header.sensor.camera.lines() >= 2 * _PART
+        if take is not None and large and np.isfinite(table.pose[images]).all():
+            most, some = _PART, copy(scan)
             # Parts of a cloud share their error patterns, which are those of the whole scan.
-            some = copy(scan)
-            some.laser_on = np.isin(np.arange(len(scan)), images[sample_indices(len(images), _SAMPLED_IMAGES)])
+            some.laser_on = np.isin(np.arange(len(scan)), images[:: max(1, len(images) // _SAMPLED_IMAGES)])
             with suppress(CaptureError, CalibrationError):  # too few stripes in these: the first part determines them
                 measure(find_stripes(some, options=stripe))
         kept, lines, rays = list[PointCloud](), Counter[str](), Counter[str]()
@@ -194,10 +183,8 @@ def reconstruct(
                 take(part)
             lines.update(part.lines_by_status)
             rays.update(part.rays_by_status)
-            if most < math.inf:
-                few = part.frame % max(1, len(images) // _KEPT_IMAGES) + part.line % _SAMPLED_LINES == 0
-                part = part.select(np.flatnonzero(few))
-            kept.append(part)
+            few = part.frame % max(1, len(images) // _KEPT_IMAGES) + part.line % _SAMPLED_LINES == 0
+            kept.append(part if most == math.inf else part.select(np.flatnonzero(few)))
         whole = kept[0] if len(kept) == 1 else concatenate_clouds(kept)
         return replace(whole, lines_by_status=dict(lines), rays_by_status=dict(rays))
 

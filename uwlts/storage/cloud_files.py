@@ -133,8 +133,7 @@ def write_cloud_in_parts(
         yield parts.append
         write_cloud(path, concatenate_clouds(parts) if len(parts) > 1 else parts[0], overwrite=overwrite)
         return
-    label = {"file_format": FORMAT, "version": VERSION, "along": {"patterns_mm": 1, "poses_mm": 1}}
-    with write_arrays(path, **label, overwrite=overwrite) as append:
+    with write_arrays(path, file_format=FORMAT, version=VERSION, overwrite=overwrite) as append:
 
         def write(part: PointCloud) -> None:
             arrays, known = {name: getattr(part, name) for name in KINDS}, part.uncertainty

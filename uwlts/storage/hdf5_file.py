@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import EllipsisType, MappingProxyType
+from types import EllipsisType
 from typing import Any, TypeVar
 
 import h5py
@@ -50,17 +50,12 @@ def write_label(file: h5py.File, *, file_format: str, version: int, header: Desc
 
 @contextmanager
 def write_arrays(
-    path: str | Path,
-    *,
-    file_format: str,
-    version: int,
-    overwrite: bool,
-    along: Mapping[str, int] = MappingProxyType({}),
+    path: str | Path, *, file_format: str, version: int, overwrite: bool
 ) -> Iterator[Callable[[Mapping[str, np.ndarray | None], Description], None]]:
     """Give the body a function that appends compressed arrays to a labelled file, written completely or not at all.
 
     It takes arrays by name, None for those that are not written, and the header, of which the first one is stored.
-    ``along`` are the axes that grow, 0 by default.
+    Arrays grow along their first axis, those with three axes along the second.
     """
     # The latest format protects all metadata by checksums.
     with write_atomically(path, overwrite=overwrite) as aside:
@@ -72,7 +67,7 @@ def write_arrays(
                 if not file.attrs:
                     write_label(file, file_format=file_format, version=version, header=header)
                 for name, data in held.items():
-                    axis = along.get(name, 0)
+                    axis = int(data.ndim == 3)
                     if name not in file:
                         most = tuple(None if k == axis else size for k, size in enumerate(data.shape))
                         file.create_dataset(name, data=data, maxshape=most, **_PACKED)
