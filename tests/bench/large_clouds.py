@@ -1,7 +1,7 @@
 """Time and memory of commands on large clouds: ``python -m tests.bench.large_clouds [--write]``, 10^7 points each.
 
-The clouds are two scans of a pipe with pits, made with NumPy only, in files of 24 bytes per point. Each command runs
-alone in a process of its own.
+The clouds are two scans of a pipe with pits, made with NumPy only, in files of 24 bytes per point, and a vehicle's ride.
+Each command runs alone in a process of its own.
 """
 
 import tempfile
@@ -11,13 +11,14 @@ import numpy as np
 from cyclopts import App
 
 from docs.studies.result_tables import publish, table
-from tests.bench.streams import run_alone
+from tests.bench.streams import RECONSTRUCT, run_alone, write_ride
 from tests.oracles.pipes import Bump, scan_pipe
 from uwlts.runtime.command_line import show
 
 _RADIUS_MM, _ARC, _NOISE_MM = 57.15, 1.2, 0.02
 _POINTS_AT_ONCE = 1_000_000
 """Points of a section of the pipe: the oracle makes several arrays of this size."""
+_POINTS_OF_PROFILE = 624
 _POINTS_PER_MM2 = 40.0
 
 
@@ -35,7 +36,9 @@ def main(points: int = 10_000_000, *, write: bool = False) -> int:
         folder = Path(name)
         for seed, cloud in enumerate(("before.ply", "after.ply")):
             _write_pipe(folder / cloud, points, seed=seed)
+        write_ride(folder, points // _POINTS_OF_PROFILE)
         commands = (
+            (RECONSTRUCT, 4.0),
             ("uwlts export after.ply --out after.laz", 4.0),
             ("uwlts inspect after.ply --wall-mm 9.5 --out after.json", 4.0),
             ("uwlts compare after.ply before.ply --out change.html", 8.0),
