@@ -1,6 +1,6 @@
 """Time and memory of commands on large clouds: ``python -m tests.bench.large_clouds [--write]``, 10^7 points each.
 
-The clouds are two scans of a pipe with pits, made with NumPy only, in files of 24 bytes per point, and a vehicle's ride.
+The clouds are two scans of a pipe with pits, made with NumPy only, in files of 24 bytes per point, and a ride.
 Each command runs alone in a process of its own.
 """
 

@@ -286,6 +286,5 @@ def thesis(
 @command_from(app, uwlts.report, "write_domain_gap", job="Inspect", shortcuts=STRIPE)
 def domain_gap(call: Call) -> None:
     """Example: uwlts domain-gap runs/clean runs/turbid --real photographs bust/laser.png --out gap.html"""
-    found = call()
-    show(found.lines())
+    show(call().lines())
     wrote_page(Path(call.given["out"]))

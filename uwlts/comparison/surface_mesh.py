@@ -204,8 +204,7 @@ def _corners_near(cells: np.ndarray) -> np.ndarray:
     shape = cells.max(axis=0) + 8
     keys = _sort_unique(np.asarray(np.ravel_multi_index(tuple(cells.T + 3), tuple(shape))))
     for axis in range(3):
-        step = int(np.prod(shape[axis + 1 :]))
-        keys = _sort_unique((keys + step * np.arange(-2, 4)[:, None]).ravel())
+        keys = _sort_unique((keys + int(np.prod(shape[axis + 1 :])) * np.arange(-2, 4)[:, None]).ravel())
     corners = np.empty((len(keys), 3), np.int32)
     for axis, place in enumerate(np.unravel_index(keys, tuple(shape))):
         corners[:, axis] = place - 3
@@ -289,8 +288,7 @@ def _weld_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
     pairs = shared[KDTree(vertices[shared]).query_pairs(1e-3, output_type="ndarray")]
     links = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(vertices),) * 2)
     owner = connected_components(links, directed=False)[1]
-    first = np.unique(owner, return_index=True)[1]
-    return vertices[first], owner[faces]
+    return vertices[np.unique(owner, return_index=True)[1]], owner[faces]
 
 
 def _orient_faces(places: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> np.ndarray:

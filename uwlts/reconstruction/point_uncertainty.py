@@ -200,8 +200,7 @@ def point_uncertainty(
     # Patterns are smooth over the points, so that a sample determines the principal ones.
     chosen = ErrorPatterns() if chosen is None else chosen
     if chosen.of_sensor is None:
-        few = slice(None, None, max(1, len(line) // _SAMPLED))
-        sampled = moved(few, np.eye(2 + len(by_stage)))[1]
+        sampled = moved(slice(None, None, max(1, len(line) // _SAMPLED)), np.eye(2 + len(by_stage)))[1]
         chosen.of_sensor = principal_components(sampled, left_mm=_NEGLIGIBLE_MM)
     weights = chosen.of_sensor
     random, patterns = moved(slice(None), weights)
@@ -213,8 +212,7 @@ def point_uncertainty(
     # Except for blur, the errors of sensor, stage and water are common to all scans in this medium.
     source = f"{digest or calibration_digest(calibration)} {header.medium_name} {header.stage_direction}"
     name = sha256(source.encode()).hexdigest()[:16]
-    of_sensor_parts = np.delete(weights, [0, 2], axis=0)
-    shared = {f"{WATER} {name}": weights[2:3].T, f"sensor {name}": of_sensor_parts.T}
+    shared = {f"{WATER} {name}": weights[2:3].T, f"sensor {name}": np.delete(weights, [0, 2], axis=0).T}
     return PointUncertainty(random, position, patterns, shared=shared)
 
 
@@ -323,8 +321,7 @@ def stage_components(
         StageParameter.SCALE: described
     }
     calibrated = [key for key in ways if key in keys and (key not in SLOPES or found is not None)]
-    lean = uncertainty.stage_lean()
-    std = dict.fromkeys(SLOPES, lean) | {StageParameter.SCALE: uncertainty.stage_scale}
+    std = dict.fromkeys(SLOPES, uncertainty.stage_lean()) | {StageParameter.SCALE: uncertainty.stage_scale}
     within = sum((np.outer(root[keys.index(key)], ways[key]) for key in calibrated), np.zeros((root.shape[1], 3)))
     if found is not None:
         # An estimated direction turns with the OCS, a described one does not.

@@ -438,9 +438,8 @@ def omit_points(points_mm: np.ndarray, omitted: Mapping[str, np.ndarray]) -> tup
     finite, zero = np.isfinite(x) & np.isfinite(y) & np.isfinite(z), (x == 0) & (y == 0) & (z == 0)
     reasons = {"without finite coordinates": ~finite, **omitted}
     if (count := np.count_nonzero(zero)) > FEW_ZEROS:
-        others = points_mm[finite & ~zero]
         # Points in rounded coordinates may coincide anywhere.
-        repeated = np.unique(np.sort(others @ _MIXED), return_counts=True)[1].max(initial=1)
+        repeated = np.unique(np.sort(points_mm[finite & ~zero] @ _MIXED), return_counts=True)[1].max(initial=1)
         if count > FEW_ZEROS * repeated:
             reasons["at exactly 0 0 0"] = zero
     unwanted, warnings = np.zeros(len(points_mm), bool), []

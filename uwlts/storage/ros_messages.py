@@ -107,8 +107,7 @@ def unpack_points(message: Any) -> np.ndarray:
         "itemsize": message.point_step,
     }
     rows = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.row_step)
-    packed = np.ascontiguousarray(rows[:, : message.width * message.point_step])
-    return packed.view(np.dtype(layout)).ravel()
+    return np.ascontiguousarray(rows[:, : message.width * message.point_step]).view(np.dtype(layout)).ravel()
 
 
 TOPIC = "/points"
