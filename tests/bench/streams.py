@@ -74,12 +74,13 @@ def write_ride(folder: Path, frames: int) -> None:
             profile = Coordinates().stripe(rows, stripe_along=camera.stripe_along, length_px=length)
             writer.append(Frame(profile, 0.0, True, 1.0, k / RATE_HZ))
     with h5py.File(folder / "ride.h5", "r+") as file:
-        for dataset in [each for each in file.values() if len(each) and len(each) < frames]:
+        for name, dataset in file.items():
             first = dataset[...]
             dataset.resize(frames, axis=0)
-            if dataset.name != "/frames":
+            if name == "time_s":
+                dataset[...] = np.arange(frames) / RATE_HZ
+            elif name != "frames":
                 dataset[...] = np.resize(first, dataset.shape)
-        file["time_s"][...] = np.arange(frames) / RATE_HZ
     times = np.linspace(-1.0, frames / RATE_HZ + 1.0, max(20, frames // 10))
     poses = np.tile(np.eye(4), (len(times), 1, 1))
     poses[:, 0, 3] = SPEED_MM_PER_S * times

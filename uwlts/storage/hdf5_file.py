@@ -50,7 +50,7 @@ def write_label(file: h5py.File, *, file_format: str, version: int, header: Desc
 
 @contextmanager
 def write_arrays(
-    path: str | Path, *, file_format: str, version: int, overwrite: bool
+    path: str | os.PathLike[str], *, file_format: str, version: int, overwrite: bool
 ) -> Iterator[Callable[[Mapping[str, np.ndarray | None], Description], None]]:
     """Give the body a function that appends compressed arrays to a labelled file, written completely or not at all.
 
@@ -60,6 +60,7 @@ def write_arrays(
     # The latest format protects all metadata by checksums.
     with write_atomically(path, overwrite=overwrite) as aside:
         with h5py.File(aside, "w", libver="latest", locking=False) as file:
+            stored: dict[str, h5py.Dataset] = {}
 
             def append(arrays: Mapping[str, np.ndarray | None], header: Description) -> None:
                 held = {name: data for name, data in arrays.items() if data is not None}
@@ -68,13 +69,13 @@ def write_arrays(
                     write_label(file, file_format=file_format, version=version, header=header)
                 for name, data in held.items():
                     axis = int(data.ndim == 3)
-                    if name not in file:
+                    if name not in stored:
                         most = tuple(None if k == axis else size for k, size in enumerate(data.shape))
-                        file.create_dataset(name, data=data, maxshape=most, **_PACKED)
+                        stored[name] = file.create_dataset(name, data=data, maxshape=most, **_PACKED)
                     else:
-                        first = file[name].shape[axis]
-                        file[name].resize(first + data.shape[axis], axis)
-                        file[name][(slice(None),) * axis + (slice(first, None),)] = data
+                        first = stored[name].shape[axis]
+                        stored[name].resize(first + data.shape[axis], axis)
+                        stored[name][(slice(None),) * axis + (slice(first, None),)] = data
 
             yield append
         truncate(aside)
