@@ -106,8 +106,8 @@ def reconstruct(
         Calculate the uncertainty of the points, which requires a joint calibration; by default if it is joint. Files
         are then more than ten times larger.
     take : callable, optional
-        Called with the cloud, or with parts of at least half a million points in the order of the images if all have a
-        pose and there are more. The result is then a sample of the points, with the counts of all.
+        Called with the cloud, or with parts of half a million points or more if all images have a pose. The result of
+        parts is a sample of their points, with the counts of all.
     progress : callable, optional
         Called after each image with the number of images done and the total number.
 

@@ -54,8 +54,8 @@ def write_arrays(
 ) -> Iterator[Callable[[Mapping[str, np.ndarray | None], Description], None]]:
     """Give the body a function that appends compressed arrays to a labelled file, written completely or not at all.
 
-    It takes arrays by name, None for those that are not written, and the header, of which the first one is stored.
-    Arrays grow along their first axis, those with three axes along the second.
+    It takes arrays by name, None for those that are not written, and the header; the first header is stored. Arrays
+    grow along their first axis, those with three axes along the second.
     """
     # The latest format protects all metadata by checksums.
     with write_atomically(path, overwrite=overwrite) as aside:

@@ -109,7 +109,7 @@ def fit_sheet(
     ``largest_rejected`` is the permitted fraction of outliers.
 
     CalibrationError if the points do not determine a plane or are not on one, or its normal is far from the nominal
-    one, or its distance from the camera differs from ``nominal_offset_mm`` by a factor that indicates wrong units.
+    one. The same if its distance from the camera differs from ``nominal_offset_mm`` as by wrong units.
     """
     try:
         robust = fit_robustly(Plane.fit, points_mm, towards=nominal_normal)
