@@ -342,7 +342,9 @@ class KnownPasses:
             posed = add_platform_poses(scan, ride, self._mount)
             found, doubts = _gather(scan, posed, ride.rates, prior, None, self._stripe)
             doubts = [*ride.doubts, *doubts]
-        _refuse_repeated([*self._passes, *found])
+        for one, other in combinations([*self._passes, *found], 2):
+            if np.array_equal(one.centre_px, other.centre_px):
+                raise CaptureError(f"{other.name} holds the same stripes as {one.name}: give each pass once")
         self._passes += found
         self._warnings += [text if scan.path.name in text else f"{scan.path.name}: {text}" for text in doubts]
         exact = "the mount counts as exact: give `mount`, or state poses whose uncertainty contains it"
@@ -372,12 +374,6 @@ def _read_prior(given: Calibration | str | Path, medium: Medium) -> Calibration:
         prior = as_built(load_sensor(given), medium) if built else read_calibration(given)
     require_joint(prior)
     return prior
-
-
-def _refuse_repeated(passes: Sequence[Pass]) -> None:
-    for one, other in combinations(passes, 2):
-        if np.array_equal(one.centre_px, other.centre_px):
-            raise CaptureError(f"{other.name} holds the same stripes as {one.name}: give each pass once")
 
 
 def _make_problem(

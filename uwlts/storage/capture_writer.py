@@ -184,7 +184,10 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             raise CaptureError(
                 f"a frame at {frame.time_s} s cannot follow one at {self._last_s} s: give increasing times"
             )
-        _require_pose(frame.pose)
+        if frame.pose is not None and (np.shape(frame.pose) != (4, 4) or not np.isfinite(frame.pose).all()):
+            raise CaptureError(f"a pose must be a finite array (4, 4); found {frame.pose}")
+        if frame.pose is not None and not is_rigid(frame.pose, within=POSE_ROUNDED):
+            raise CaptureError(f"a pose must be a rotation, a shift and 0 0 0 1; found {frame.pose.tolist()}")
         if frame.pose_covariance is not None:
             if COVARIANCE not in self._columns:
                 raise CaptureError("the capture was begun without covariances of poses: begin it with covariances=True")
@@ -259,13 +262,6 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
                     forget_plan(self._part)
                 truncate(self._part)
                 os.replace(self._part, self.path)
-
-
-def _require_pose(pose: np.ndarray | None) -> None:
-    if pose is not None and (np.shape(pose) != (4, 4) or not np.isfinite(pose).all()):
-        raise CaptureError(f"a pose must be a finite array (4, 4); found {pose}")
-    if pose is not None and not is_rigid(pose, within=POSE_ROUNDED):
-        raise CaptureError(f"a pose must be a rotation, a shift and 0 0 0 1; found {pose.tolist()}")
 
 
 def _lock(part: Path) -> BufferedReader:

@@ -207,11 +207,12 @@ def _add_backgrounds(folder: Path, found: list[str], given: ImportDescription, l
             "each, else name them in a table's column background"
         )
     one, other = count_names(found), count_names([row.file for row in laser])
-    if one and other and len(found) > 1 and (one.places() != other.places()).any():
-        raise DescriptionError(
-            "the numbers of laser and background images have different gaps: name the backgrounds in a table's column "
-            "background"
-        )
+    if one and other and len(found) > 1:
+        first = int(one.numbers[0]) if set(one.numbers) & set(other.numbers) else None
+        if (one.places(first) != other.places(first)).any():
+            raise DescriptionError(
+                "the numbers of laser and background images differ: name the backgrounds in a table's column background"
+            )
     names = found * len(laser) if len(found) == 1 else found
     return [replace(row, background=name) for row, name in zip(laser, names, strict=True)]
 
