@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from cyclopts import App
-from result_tables import publish, table
+from result_tables import name_once, publish, table
 
 import twin
 from twin.experiments.figures import draw_means, select_means
@@ -87,8 +87,8 @@ def thesis(folder: Path, *, campaigns: int, write: bool = False) -> None:
     for row in [row for row in select_means(published) if row.table.startswith(PROPOSED)]:
         values = f"{row.published:g}", f"{row.mean:.3f}", f"{row.ratio:.2f}"
         rows.append([row.table, row.figure, *values])
-    head = ["mean over the positions", "", "published, mm", "reproduced, mm", "reproduced / published"]
-    publish({"thesis": table(head, rows)}, write=write)
+    head = ["mean over the positions", "", "published, mm", "reproduced, mm", "ratio"]
+    publish({"thesis": table(head, name_once(rows))}, write=write)
     if write:
         draw_means(published).savefig(PICTURE)
 

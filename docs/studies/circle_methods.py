@@ -21,11 +21,11 @@ RIM_POINTS, NEAREST_PX = 720, 3.0
 
 
 def circles_table() -> str:
-    """Errors of the centres by place and method, px."""
+    """Return the errors of the centres, px, by method and place; circles are counted where one is not found."""
     from twin.recording.sensor_simulator import SensorSimulator
 
-    sensor, rows = load_sensor("thesis"), []
-    for name, stage in STAGE_MM.items():
+    sensor, rows = load_sensor("thesis"), dict[str, list[str]]()
+    for stage in STAGE_MM.values():
         along = {"direction": (0.0, 0.0, 1.0), "start_mm": stage, "count": 1, "lights": ("lamp",)}
         scene = load_scene("target", motion=along)
         studio = SensorSimulator(sensor, scene, Options(spp=64))
@@ -41,8 +41,9 @@ def circles_table() -> str:
             found = int(np.isfinite(error[:, 0]).sum())
             largest = np.linalg.norm(error[both], axis=1).max()
             rms = math.sqrt((error[both] ** 2).sum(axis=1).mean())
-            rows.append([name, method, f"{found} of {len(truth)}", f"{rms:.3f}", f"{largest:.3f}"])
-    return table(["target", "method", "circles found", "rms px", "largest px"], rows)
+            counted = "" if found == len(truth) else f", {found} of {len(truth)}"
+            rows.setdefault(method, []).append(f"{rms:.3f} ({largest:.3f}){counted}")
+    return table(["rms (largest) px", *STAGE_MM], [[method, *cells] for method, cells in rows.items()])
 
 
 def ellipses_of_contours(image: np.ndarray) -> np.ndarray:

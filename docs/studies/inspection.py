@@ -37,7 +37,7 @@ from uwlts.storage.capture_writer import CaptureWriter
 
 HOLLOWS = FeatureKind.PIT, FeatureKind.DENT
 BLEMISHES = *HOLLOWS, FeatureKind.PROTRUSION
-HEAD = ["of", "value", "number", "bias", "spread", "truth within the 95 % interval"]
+HEAD = ["of", "value", "number", "spread", "truth within the 95 % interval"]
 DRAWS = 0, 5
 SHOWN = (
     "depth",
@@ -123,8 +123,7 @@ def figure_rows(name: str, pairs: Pairs) -> list[list[str]]:
             continue
         error = np.array([each.value - truth for each, truth in known])
         inside = sum(each.low <= truth <= each.high for each, truth in known)
-        sizes = f"{error.mean():+.4f}", f"{error.std():.4f}"
-        rows.append([name, value, f"{len(known)}", *sizes, f"{inside} of {len(known)}"])
+        rows.append([name, value, f"{len(known)}", f"{error.std():.4f}", f"{inside} of {len(known)}"])
     return rows
 
 

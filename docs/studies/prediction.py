@@ -245,8 +245,8 @@ def detect(folder: Path, *, every: int = 2, write: bool = False) -> None:
             hits = f"{sum(each.found)} of {len(each.found)}"
             depths = ("-" if depth is None else f"{depth:.3f}" for depth in (each.a90_mm, each.a90_95_mm))
             flaw = f"{each.flaw}s, {each.width_mm:g} mm wide"
-            rows.append([water, flaw, hits, f"{each.false_calls}", *depths, each.limits()])
-    head = ["water", "flaws", "found", "false calls", "a90, mm", "a90/95, mm", "limits"]
+            rows.append([water, flaw, hits, f"{each.false_calls}", *depths])
+    head = ["water", "flaws", "found", "false calls", "a90, mm", "a90/95, mm"]
     publish({"detection of flaws": table(head, rows)}, write=write)
 
 

@@ -123,6 +123,14 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
 
 
+def name_once(rows: Sequence[Sequence[str]]) -> list[list[str]]:
+    """Return rows with an empty first cell if it is that of the row above."""
+    names = [row[0] for row in rows]
+    return [
+        ["" if name == above else name, *row[1:]] for name, above, row in zip(names, ["", *names], rows, strict=False)
+    ]
+
+
 def describe_measurement() -> str:
     """Return the line that precedes measured tables: today's date, the commit, and the command that runs."""
     commit, changes = _git("rev-parse", "--short=7", "HEAD"), _git("status", "--porcelain", "--", *CODE)

@@ -17,6 +17,7 @@ from uwlts.stripe.exposures import fuse_exposures
 
 BRACKET = (1.0, 5.0, 25.0)
 FRAMES, CLEAR_MM, FULL_DN = 6, 2.0, 255.0
+SHOWN = "exposure 1", "exposure 25", "bracket"
 
 
 def scene(*things: dict[str, object]) -> Scene:
@@ -52,11 +53,7 @@ def rows() -> Iterator[list[str]]:
             truth = find_true_stripe(studio.renderer, studio.pose(shot))
             images = [studio.expose(shot, 10 * number + k, exposure=BRACKET[k]).image for k in range(len(BRACKET))]
             image, saturation = fuse_exposures(images, exposure, full_dn=FULL_DN)
-            looked = {
-                "exposure 1": (images[0], FULL_DN),
-                "exposure 25": (images[-1], FULL_DN),
-                "bracket": (image, saturation),
-            }
+            looked = dict(zip(SHOWN, ((images[0], FULL_DN), (images[-1], FULL_DN), (image, saturation)), strict=True))
             y = truth.point_mm[:, 1]
             for shown, (each, full) in looked.items():
                 found = extract_stripe(each, stripe_along=sensor.camera.stripe_along, saturation=full)
@@ -65,18 +62,20 @@ def rows() -> Iterator[list[str]]:
                     if len(surfaces) > 1:
                         here &= (y < -CLEAR_MM - 2.0) if surface == "rubber" else (y > CLEAR_MM + 2.0)
                     errors.setdefault((surface, shown), []).append((found.centre_px - truth.centre_px)[here])
-        for (surface, shown), values in sorted(errors.items(), key=lambda one: one[0][0]):
-            error = np.concatenate(values)
-            near = error[np.abs(error) < 2.0]
-            spread = f"{np.std(near):.3f}" if len(near) else "none"
-            yield [surface, shown, f"{100 * len(near) / len(error):.1f}", spread]
+        for surface in surfaces:
+            cells = []
+            for shown in SHOWN:
+                error = np.concatenate(errors[surface, shown])
+                near = error[np.abs(error) < 2.0]
+                part = "" if len(near) == len(error) else f" on {100 * len(near) / len(error):.1f} %"
+                cells.append(f"{np.std(near):.3f}{part}" if len(near) else "not found")
+            yield [surface, *cells]
 
 
 def main(*, write: bool = False) -> None:
     """Print the table; with `--write`, put it into its page."""
     use_variant()
-    head = ["surface", "image", "lines found %", "std px"]
-    publish({"exposure brackets": table(head, list(rows()))}, write=write)
+    publish({"exposure brackets": table(["std px", *SHOWN], list(rows()))}, write=write)
 
 
 if __name__ == "__main__":

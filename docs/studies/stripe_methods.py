@@ -57,8 +57,8 @@ def spread_table(frames: int) -> str:
 def exposure_table(frames: int) -> str:
     """Standard deviation in px by exposure, on the plane at the stand-off."""
     place = places()["plane, stand-off"]
-    rows = [[f"{level:g}", f"{spread(place, FIT, frames, level).std_px:.3f}"] for level in LEVELS]
-    return table(["exposure / automatic", f"{FIT}: std px"], rows)
+    row = [f"{FIT}, std px", *(f"{spread(place, FIT, frames, level).std_px:.3f}" for level in LEVELS)]
+    return table(["exposure / automatic", *(f"{level:g}" for level in LEVELS)], [row])
 
 
 def limits_table(frames: int) -> str:

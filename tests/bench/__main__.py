@@ -387,9 +387,9 @@ def _as_markdown(rows: list[Row]) -> str:
     cells = []
     for row in rows:
         numbers = f"{_figures(row.value)} {row.unit}", f"{row.limit:,g}"
-        ratio = "" if row.floor is None else f"{row.ratio:.3g} (at most {row.floor.most:g})"
+        ratio = "" if row.floor is None else f"{row.ratio:.3g} ({row.floor.most:g})"
         cells.append([row.name, *numbers, ratio, "" if row.ok else "missed"])
-    return result_tables.table(["what", "median", "limit", "times a plain computation", ""], cells)
+    return result_tables.table(["what", "median", "limit", "times a plain computation (limit)", ""], cells)
 
 
 def _figures(value: float) -> str:
