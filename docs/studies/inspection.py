@@ -206,7 +206,7 @@ def unchanged_rows(folder: Path, water: str, draw: int) -> list[list[str]]:
         clear = change.compared & np.all(distances(pits, change.points_mm) > reach, axis=1)
         share = f"{100 * float(change.significant[clear].mean()):.1f} %"
         pit = "small" if name == "pipe-after" else "large"
-        rows.append([f"{draw}", water, pit, f"{clear.sum():,}", share])
+        rows.append([f"{draw}", water, pit, share])
     return rows
 
 
@@ -221,7 +221,7 @@ def main(folder: Path, *, write: bool = False) -> None:
             for name, some in (pits_in(own, water, draw) | wholes_in(own, water)).items():
                 pairs.setdefault(name, []).extend(some)
             changes += unchanged_rows(own, water, draw)
-    head = ["draw", "water", "pits", "places", "claimed"]
+    head = ["draw", "water", "pits", "claimed"]
     tables = {"inspected values": table(HEAD, [row for name, some in pairs.items() for row in figure_rows(name, some)])}
     tables |= {"changes of rendered pipes": table(head, changes), "meshes": mesh_table(folder / str(DRAWS[0]))}
     publish(tables, write=write)

@@ -136,7 +136,7 @@ def stripe_rows(name: str, halves: Sequence[list[np.ndarray]]) -> Iterator[Row]:
     """Yield the rows of a stripe from the groups of both halves; the second is empty if it is not known yet."""
     first, *second = (stripe_residuals(half) for half in halves if half)
     others = len(halves[0])
-    for k, residual in enumerate(("centre noise", "centres about parabolas", "means of 8 centres, times root 8")):
+    for k, residual in enumerate(("centre noise", "centres about parabolas", "means of 8 centres")):
         found = second[0][k] if second else ()
         yield Row.of(name, residual, "px", first[k], found, others=others, stated=first[0])
 
