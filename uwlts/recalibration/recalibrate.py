@@ -19,7 +19,7 @@ from uwlts.model.calibration import Calibration, KnownMedium, KnownStage, calibr
 from uwlts.model.library import load_sensor
 from uwlts.model.mount import Mount
 from uwlts.model.parameter_keys import ParameterKey
-from uwlts.model.sensor import CaptureHeader, Medium
+from uwlts.model.sensor import CaptureHeader, Medium, to_rows
 from uwlts.model.short_text import Brief
 from uwlts.model.trajectory import Trajectory
 from uwlts.optics.brightness import select_sharp_lines
@@ -628,7 +628,7 @@ def _build(
             "values": tuple(moved.values.tolist()),
             "std": tuple(np.sqrt(np.diag(covariance)).tolist()),
             "std_before": tuple(old.get(key, float(std)) for key, std in zip(keys, before, strict=True)),
-            "covariance": tuple(map(tuple, covariance.tolist())),
+            "covariance": to_rows(covariance),
         }
     )
     provenance = prior.provenance | {

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.fitting.next_observation import CovarianceRoot
 from uwlts.model.mount import Mount
+from uwlts.model.sensor import to_rows
 from uwlts.model.trajectory import Trajectory, convert_to_platform_clock, format_time
 from uwlts.runtime.compiled import compiled
 from uwlts.storage.capture import Capture, FrameTable
@@ -140,7 +141,7 @@ def add_platform_poses(capture: Capture, ride: PlatformPoses, mount: Mount | Non
     """Return the frames of a capture with the poses of the platform and the transform of the mount."""
     header = capture.header
     if mount is not None:
-        header = header.model_copy(update={"T_platform_sensor": tuple(map(tuple, mount.transform().tolist()))})
+        header = header.model_copy(update={"T_platform_sensor": to_rows(mount.transform())})
     known = capture.stage_mm, capture.exposure_ms, ride.poses, capture.speed_mm_per_s
     return FrameTable(header, capture.path, *known)
 

@@ -61,7 +61,12 @@ def write_camera(path: str | Path, camera: CameraCalibration, *, overwrite: bool
         for each in camera.photographs
     ]
     models = [
-        [each.name, str(each.parameters()), f"{each.rms_px:.4f}", "taken" if each.options == lens.options else ""]
+        [
+            each.options.name,
+            str(each.parameters()),
+            f"{each.rms_px:.4f}",
+            "taken" if each.options == lens.options else "",
+        ]
         for each in lens.candidates
     ]
     text = render_page(

@@ -85,11 +85,6 @@ class LensCandidate:
     rms_px: float
     worse: float
 
-    @property
-    def name(self) -> str:
-        """Coefficients and pixel shape."""
-        return _name(self.options)
-
     def parameters(self) -> int:
         """Return the number of estimated parameters."""
         return len(self.options.distortion) + (4 if self.options.pixel_aspect is None else 3)
@@ -114,11 +109,6 @@ class LensCalibration:
     candidates: list[LensCandidate]  # compared models; empty if the model was given
     options: CameraOptions  # selected model
     covariance: np.ndarray  # (P, P); of the parameters, with correlated errors in each image
-
-    @property
-    def name(self) -> str:
-        """Name of the lens model."""
-        return _name(self.options)
 
     def values(self) -> dict[str, float]:
         """Return every estimated parameter."""
@@ -295,12 +285,6 @@ def calibrate_lens(
         options=options,
         covariance=solution.covariance * np.outer(larger, larger),
     )
-
-
-def _name(options: CameraOptions) -> str:
-    coefficients = " ".join(options.distortion) or "no distortion"
-    shape = {None: "free pixels", 1.0: "square pixels"}
-    return f"{coefficients}, {shape.get(options.pixel_aspect) or f'pixels of aspect {options.pixel_aspect:g}'}"
 
 
 def _candidates(any_of: Sequence[tuple[str, ...]], choice: LensChoice, poses: Poses) -> list[CameraOptions]:
