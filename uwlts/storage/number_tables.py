@@ -255,7 +255,7 @@ def _names_and_units(cells: list[str], path: Path) -> tuple[list[str], dict[str,
 
 
 def _name_axes(names: list[str], path: Path) -> tuple[list[str], tuple[str, ...]]:
-    """Return names with x, y and z in place of three directions, and these; raises DescriptionError if they mirror."""
+    """Return names with x, y and z for three directions, and these; DescriptionError for a left-handed frame."""
     found = tuple(name for name in names if name in _DIRECTIONS)
     if len(found) != 3 or not np.linalg.det([_DIRECTIONS[name] for name in found]):
         return names, ()

@@ -212,7 +212,7 @@ def solve(evidence: Evidence, *, options: CalibrationOptions) -> CalibrationResu
     )
     if lens is not None:
         sheet, angle = _add_image_uncertainty(sheet, lens, found), _angle_between_halves(sheet, lens, found)
-        figures["camera"] |= _lens_figures(lens, found)
+        figures["camera"] |= _list_lens_figures(lens, found)
         warnings += lens.half_doubts()
         if angle is not None:
             text = f"their sheets differ by {np.degrees(angle):.3f} deg"
@@ -317,7 +317,7 @@ def _calibrate_camera(
     return camera, lens, used, warnings
 
 
-def _lens_figures(lens: LensCalibration, found: AirEvidence) -> dict[str, JsonValue]:
+def _list_lens_figures(lens: LensCalibration, found: AirEvidence) -> dict[str, JsonValue]:
     """Return compared models and used images for files; None for missing values."""
     rms = lens.solution.image_rms_px()
     columns = zip(found.names(), found.images, rms, lens.moved, found.stripes, found.outliers, strict=True)
