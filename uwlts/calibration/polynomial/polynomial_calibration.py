@@ -447,7 +447,7 @@ def fit_polynomials(
         depth_coefficients=to_rows(depth.coefficients[rows[0]]),
         along_coefficients=to_rows(along.coefficients[rows[1]]),
     )
-    map_rms_mm = _rms_length(np.concatenate([m.residuals for m in maps]))
+    map_rms_mm = float(np.sqrt(np.mean(np.sum(np.concatenate([m.residuals for m in maps]) ** 2, axis=1))))
     used, lines = depth.used, stripes.lines
     excess, along_excess = _line_excess(depth, lines), _line_excess(along, lines[used])
     poses, stripe_points = np.unique(stripes.pose, return_counts=True)
@@ -475,10 +475,6 @@ def fit_polynomials(
     provenance |= {} if camera.offset_px is None else {"offset_px": list(camera.offset_px)}
     calibration = calibration.model_copy(update={"residuals": figures, "provenance": provenance})
     return PolynomialResult(calibration, stripes, depth, along, warnings)
-
-
-def _rms_length(vectors: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
 
 
 def _line_excess(fit: LinePolynomials, lines: np.ndarray) -> float:
