@@ -88,7 +88,7 @@ def camera_lines(camera: CameraCalibration) -> list[str]:
     """Return the result as lines of text."""
     taken = camera.lens.options
     models = [
-        f"  {each.name:32} {each.rms_px:8.4f} px" + ("   taken" if each.options == taken else "")
+        f"  {each.options.name:32} {each.rms_px:8.4f} px" + ("   taken" if each.options == taken else "")
         for each in camera.lens.candidates
     ]
     return _summary(camera) + (
