@@ -222,9 +222,8 @@ def _path_modes(ride: PlatformPoses, correlation_s: float | None) -> tuple[np.nd
 def _path_errors(ride: PlatformPoses, times_s: np.ndarray, modes: np.ndarray) -> np.ndarray:
     """Return independent errors (F, 6, 6 K) of poses along a path, by temporal modes (K, T) at times (T,)."""
     assert ride.covariance is not None
-    at_images = np.stack([np.interp(ride.times_s, times_s, mode) for mode in modes], axis=1)
-    roots = root_covariances(ride.covariance)
-    return (roots[:, :, None] * at_images[:, None, :, None]).reshape(len(roots), 6, -1)
+    at = np.stack([np.interp(ride.times_s, times_s, mode) for mode in modes], axis=1)
+    return (root_covariances(ride.covariance)[:, :, None] * at[:, None, :, None]).reshape(len(at), 6, -1)
 
 
 def _pose_correlation(covariances: np.ndarray, times_s: np.ndarray, correlation_s: float | None) -> np.ndarray:
