@@ -13,7 +13,7 @@ COPY uwlts /opt/uwlts/uwlts
 COPY twin /opt/uwlts/twin
 COPY scenes /opt/uwlts/scenes
 RUN python3 -m venv /opt/venv \
-    && pip install --no-cache-dir '/opt/uwlts[clouds,registration]' jupyterlab jupytext \
+    && pip install --no-cache-dir '/opt/uwlts[clouds,registration]' jupyterlab jupytext ipywidgets \
     # The wheel of LLVM finishes its installation at the first start of Python, and needs to write for that.
     && python -m twin.backend.llvm
 COPY docs/tutorials /opt/uwlts/tutorials

@@ -31,7 +31,7 @@ def serve(call: Call) -> None:
     with call() as served:
         say("\n".join([*served.lines(), "serving; stop with Ctrl-C"]))
         served.wait_for_end()
-    say(f"ended after {served.rates()}")
+    say(f"ended after {served.bench.frames} frames")
 
 
 @command_from(app, twin, "record", job="Simulate")

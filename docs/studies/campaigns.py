@@ -1,17 +1,16 @@
-"""Rendered campaigns of the demonstration and of the thesis, calibrated by several methods.
+"""Rendered campaigns of the thesis, calibrated by several methods.
 
-    python docs/studies/campaigns.py demo FOLDER [--write]
     python docs/studies/campaigns.py thesis FOLDER --campaigns 3 [--write]
     python docs/studies/campaigns.py joint FOLDER --campaigns 10 --every 3 [--write]
 
-Campaigns are those of `twin demo` and `twin reproduce`. Complete recordings in the folder are kept.
+Campaigns are those of `twin reproduce`. Complete recordings in the folder are kept.
 """
 
 from pathlib import Path
 
 import numpy as np
 from cyclopts import App
-from result_tables import publish, table
+from result_tables import name_once, publish, table
 
 import twin
 from twin.experiments.figures import draw_means, select_means
@@ -36,14 +35,14 @@ def read(folder: Path) -> ExperimentResult:
     return ExperimentResult.model_validate_json((folder / RESULT).read_text(encoding="utf-8"))
 
 
-def pooled(rows: tuple[MeasuredFigure, ...]) -> dict[tuple[str, str], dict[str, list[MeasuredFigure]]]:
-    """Return the rows with a known true value by figure, medium and method."""
-    found: dict[tuple[str, str], dict[str, list[MeasuredFigure]]] = {}
+def pooled(rows: tuple[MeasuredFigure, ...]) -> dict[str, dict[str, list[MeasuredFigure]]]:
+    """Return the rows of scans in water with a known true value by figure and method."""
+    found: dict[str, dict[str, list[MeasuredFigure]]] = {}
     for row in rows:
         name = next((name for name, some in POOLED.items() if row.figure.startswith(some)), None)
-        if name is not None and row.true_mm is not None and "known" not in row.figure:
-            key = name, "in air" if row.scan.endswith("-air") else "in water"
-            found.setdefault(key, {}).setdefault(row.method, []).append(row)
+        known = row.true_mm is not None and "known" not in row.figure
+        if name is not None and known and not row.scan.endswith("-air"):
+            found.setdefault(name, {}).setdefault(row.method, []).append(row)
     return found
 
 
@@ -52,7 +51,7 @@ def errors_table(result: ExperimentResult) -> str:
     groups = pooled(result.table.rows)
     methods = list(dict.fromkeys(method for some in groups.values() for method in some))
     rows = []
-    for (name, medium), some in groups.items():
+    for name, some in groups.items():
         sizes = {method: np.abs([row.error_mm for row in own]) for method, own in some.items()}
         within = {
             method: np.mean([abs(row.error_mm) <= row.expanded_mm for row in own])
@@ -61,22 +60,15 @@ def errors_table(result: ExperimentResult) -> str:
         }
         count = max(len(each) for each in sizes.values())
         cells = [
-            [f"{name} {medium}", "mean error", *(f"{sizes[m].mean():.4f}" if m in sizes else "" for m in methods)],
+            [name, "mean error", *(f"{sizes[m].mean():.4f}" if m in sizes else "" for m in methods)],
             ["", f"largest of {count}", *(f"{sizes[m].max():.4f}" if m in sizes else "" for m in methods)],
             ["", "within U", *(f"{100 * within[m]:.0f} %" if m in within else "" for m in methods)],
         ]
         rows += cells if within else cells[:2]
-    return table([f"{len(result.seeds)} campaigns, mm", "", *methods], rows)
+    return table([f"{len(result.seeds)} campaigns, water, mm", "", *methods], rows)
 
 
 app = App(help=__doc__, help_format="plaintext")
-
-
-@app.command
-def demo(folder: Path, *, write: bool = False) -> None:
-    """Run the demonstration and print its table; with `--write`, put it into its page."""
-    twin.demo(folder)
-    publish({"demo": errors_table(read(folder))}, write=write)
 
 
 @app.command
@@ -93,11 +85,10 @@ def thesis(folder: Path, *, campaigns: int, write: bool = False) -> None:
     published = read(folder).published
     rows = []
     for row in [row for row in select_means(published) if row.table.startswith(PROPOSED)]:
-        low, high = min(row.measured), max(row.measured)
-        values = f"{row.published:g}", f"{row.mean:.3f}", f"{low:.3f} to {high:.3f}", f"{row.ratio:.2f}"
+        values = f"{row.published:g}", f"{row.mean:.3f}", f"{row.ratio:.2f}"
         rows.append([row.table, row.figure, *values])
-    head = ["mean over the positions", "", "published, mm", "reproduced, mm", f"range of {campaigns} campaigns"]
-    publish({"thesis": table([*head, "reproduced / published"], rows)}, write=write)
+    head = ["mean over the positions", "", "published, mm", "reproduced, mm", "ratio"]
+    publish({"thesis": table(head, name_once(rows))}, write=write)
     if write:
         draw_means(published).savefig(PICTURE)
 

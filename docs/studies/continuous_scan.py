@@ -38,11 +38,11 @@ settling_s = 0.05
 
 
 def spheres(cloud, stops: np.ndarray | None = None) -> tuple[list[str], np.ndarray]:
-    """Return spacing error, scatter and shift along the stage from ``stops`` as cells, and the centres (2, 3)."""
+    """Return spacing error and shift along the stage from ``stops``, µm, as cells, and the centres (2, 3)."""
     result = uwlts.evaluate(cloud)
     centres = np.array([sphere["centre_mm"] for sphere in result.evaluation.spheres])
-    shift = "-" if stops is None else f"{1e3 * float((centres - stops)[:, 0].mean()):+.1f} µm"
-    return [f"{1e3 * value.value_mm:.1f} µm" for value in (result.sphere_spacing, result.std)] + [shift], centres
+    shift = "-" if stops is None else f"{1e3 * float((centres - stops)[:, 0].mean()):+.1f}"
+    return [f"{1e3 * result.sphere_spacing.value_mm:.1f}", shift], centres
 
 
 def main(*, write: bool = False) -> None:
@@ -97,13 +97,13 @@ def main(*, write: bool = False) -> None:
                     )
                     latency = re.search(r"latency of the stage (\S+) ms", said_by[-1])[1]
                     cells, _ = spheres(uwlts.reconstruct(folder / "moving.h5", calibration), stops)
-                    rows.append([f"{speed:.0f} mm/s", f"{1e3 * shift:.0f} ms", f"{float(latency):+.2f} ms", *cells])
+                    rows.append([f"{speed:.0f}", f"{1e3 * shift:.0f}", f"{float(latency):+.2f}", *cells])
                     print(*rows[-1], flush=True)
         finally:
             served.terminate()
             served.communicate()
-    head = ["speed", "added", "latency measured", "spacing error", "std about the spheres"]
-    publish({"continuous scans": table([*head, "centres along the stage, against the stops"], rows)}, write=write)
+    head = ["speed, mm/s", "added, ms", "latency measured, ms", "spacing error, µm"]
+    publish({"continuous scans": table([*head, "centres along the stage, against the stops, µm"], rows)}, write=write)
 
 
 if __name__ == "__main__":

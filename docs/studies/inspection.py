@@ -37,7 +37,7 @@ from uwlts.storage.capture_writer import CaptureWriter
 
 HOLLOWS = FeatureKind.PIT, FeatureKind.DENT
 BLEMISHES = *HOLLOWS, FeatureKind.PROTRUSION
-HEAD = ["of", "value", "number", "bias", "spread", "stated std", "truth within the 95 % interval"]
+HEAD = ["of", "value", "number", "spread", "truth within the 95 % interval"]
 DRAWS = 0, 5
 SHOWN = (
     "depth",
@@ -123,9 +123,7 @@ def figure_rows(name: str, pairs: Pairs) -> list[list[str]]:
             continue
         error = np.array([each.value - truth for each, truth in known])
         inside = sum(each.low <= truth <= each.high for each, truth in known)
-        stated = np.mean([each.uncertainty for each, _ in known])
-        sizes = f"{error.mean():+.4f}", f"{error.std():.4f}", f"{stated:.4f}"
-        rows.append([name, value, f"{len(known)}", *sizes, f"{inside} of {len(known)}"])
+        rows.append([name, value, f"{len(known)}", f"{error.std():.4f}", f"{inside} of {len(known)}"])
     return rows
 
 
@@ -207,9 +205,8 @@ def unchanged_rows(folder: Path, water: str, draw: int) -> list[list[str]]:
         reach = pits.diameter / 2 + change.disc_mm / 2
         clear = change.compared & np.all(distances(pits, change.points_mm) > reach, axis=1)
         share = f"{100 * float(change.significant[clear].mean()):.1f} %"
-        sizes = np.sqrt(np.mean(change.distance_mm[clear] ** 2)), np.median(change.level_mm[clear])
         pit = "small" if name == "pipe-after" else "large"
-        rows.append([f"{draw}", water, pit, f"{clear.sum():,}", share, *(f"{size:.4f}" for size in sizes)])
+        rows.append([f"{draw}", water, pit, share])
     return rows
 
 
@@ -224,7 +221,7 @@ def main(folder: Path, *, write: bool = False) -> None:
             for name, some in (pits_in(own, water, draw) | wholes_in(own, water)).items():
                 pairs.setdefault(name, []).extend(some)
             changes += unchanged_rows(own, water, draw)
-    head = ["draw", "water", "pits", "places", "claimed", "rms distance, mm", "level, mm"]
+    head = ["draw", "water", "pits", "claimed"]
     tables = {"inspected values": table(HEAD, [row for name, some in pairs.items() for row in figure_rows(name, some)])}
     tables |= {"changes of rendered pipes": table(head, changes), "meshes": mesh_table(folder / str(DRAWS[0]))}
     publish(tables, write=write)

@@ -14,7 +14,7 @@ from uwlts.model.library import load_sensor
 FIRST, COUNT = 7000, 12
 BETTER = 5
 KNOWN = {
-    "nothing more": (),
+    "nothing": (),
     "bow, saddle and twist": ("target_bow_mm",),
     "scale of the stage": ("stage_scale",),
     "shift of the stripe by its finish": ("target_stripe_px",),
@@ -33,9 +33,9 @@ def main(*, write: bool = False) -> None:
         found = [m for each in campaigns for m in run_campaign(each).measured if m.figure == SPACING]
         std, error = (1e3 * np.sqrt(np.mean(np.square([(m.std_mm, m.error_mm) for m in found]), axis=0))).tolist()
         values = " ".join(f"{name} = {value:.3g}" for name, value in known.items())
-        rows.append([what, f"`{values}`" if values else "", f"{std:.1f} µm", f"{error:.1f} µm"])
+        rows.append([f"`{values}`" if values else what, f"{std:.1f}", f"{error:.1f}"])
         print(rows[-1], flush=True)
-    head = ["known five times better", "stated in `[uncertainty]`", "standard uncertainty", "error, rms"]
+    head = ["known five times better", "stated, µm", "error, rms µm"]
     publish({"known target": table(head, rows)}, write=write)
 
 

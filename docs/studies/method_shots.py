@@ -1,6 +1,5 @@
 """Shots of the study of methods: each is rendered once and photographed often, with fresh speckle and noise."""
 
-import math
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING
@@ -158,28 +157,16 @@ LEVELS = (0.1, 0.3, 1.0, 2.0, 4.0, 8.0)
 
 @dataclass(frozen=True)
 class Spread:
-    """Bias (mean) and standard deviation of single lines, px; std in mm; fraction found.
+    """Standard deviation of single lines.
 
     Errors above 2 px, at limbs and edges, are left out.
     """
 
-    bias_px: float
     std_px: float
     std_mm: float
-    found: float
 
     @classmethod
-    def of(cls, error_px: np.ndarray, mm_per_px: np.ndarray, used: np.ndarray) -> "Spread":
+    def of(cls, error_px: np.ndarray, mm_per_px: np.ndarray) -> "Spread":
         """Calculate from errors (F, L), NaN on lines without a centre."""
         error = np.where(np.abs(error_px) <= 2.0, error_px, np.nan)
-        return cls(
-            float(np.nanmean(error)),
-            float(np.nanstd(error)),
-            float(np.nanstd(error * mm_per_px)),
-            float(np.isfinite(error_px)[:, used].mean()),
-        )
-
-
-def round_to_zero(value: float) -> float:
-    """Return zero for values that round to zero, so that tables do not show a negative zero."""
-    return 0.0 if math.isclose(value, 0.0, abs_tol=5e-4) else value
+        return cls(float(np.nanstd(error)), float(np.nanstd(error * mm_per_px)))

@@ -22,7 +22,7 @@ from cyclopts import App
 from scipy.stats import t as students_t
 
 import uwlts
-from docs.studies.result_tables import ROOT, publish, table
+from docs.studies.result_tables import ROOT, name_once, publish, table
 from uwlts.calibration.camera.camera_parameters import TargetImage
 from uwlts.calibration.camera.lens import LensChoice, calibrate_lens
 from uwlts.calibration.guidance import estimate_pose
@@ -87,13 +87,13 @@ class Row:
 
     def cells(self) -> list[str]:
         """Return the cells of the table: expected intervals, or if the second half is known its ratios to them."""
-        cells = [self.name, f"{self.residual}, {self.unit}".removesuffix(", ")]
         if self.found is None:
+            cells = [self.name, f"{self.residual}, {self.unit}".removesuffix(", ")]
             for limits in (self.expected, self.stated):
                 known = [f"{each:.0f}" if abs(each) > 100 else f"{each:.3g}" for each in limits or ()]
                 cells.append("{} ({} to {})".format(*known) if known else "nothing")
             return cells
-        cells.append(f"{self.found:.0f}" if self.found > 100 else f"{self.found:.3g}")
+        cells = [self.name, self.residual]
         for limits in (self.expected, self.stated):
             if limits is None:
                 cells.append("")
@@ -136,7 +136,7 @@ def stripe_rows(name: str, halves: Sequence[list[np.ndarray]]) -> Iterator[Row]:
     """Yield the rows of a stripe from the groups of both halves; the second is empty if it is not known yet."""
     first, *second = (stripe_residuals(half) for half in halves if half)
     others = len(halves[0])
-    for k, residual in enumerate(("centre noise", "centres about parabolas", "means of 8 centres, times root 8")):
+    for k, residual in enumerate(("centre noise", "centres about parabolas", "means of 8 centres")):
         found = second[0][k] if second else ()
         yield Row.of(name, residual, "px", first[k], found, others=others, stated=first[0])
 
@@ -318,10 +318,10 @@ def main(*, measured: bool = False, write: bool = False) -> None:
             *etna(measured, folder),
             *gap_rows(measured, folder),
         ]
-    head = ["second half", "relative to that of the first", "relative to the stated"] if measured else []
+    head = ["relative to the first", "to the stated"] if measured else []
     head = ["set", "residual", *(head or ("expected by the first half", "expected as stated"))]
     title = "real halves, measured" if measured else "real halves, expected"
-    publish({title: table(head, [row.cells() for row in rows])}, write=write)
+    publish({title: table(head, name_once([row.cells() for row in rows]))}, write=write)
 
 
 if __name__ == "__main__":

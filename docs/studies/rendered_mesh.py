@@ -70,4 +70,4 @@ def mesh_table(folder: Path) -> str:
     points = np.concatenate([cloud.points_mm for cloud in clouds])
     rows.append(row("plate of 2 mm, both sides", made, 1e3 * off_plate(made.vertices_mm), points))
     head = ["mesh", "vertices", "rms, µm", "bias, µm", "stated (1 std), µm", "truth within 95 %"]
-    return table([*head, "vertices more than 1 mm from all points"], rows)
+    return table([*head, "beyond 1 mm of all points"], rows)

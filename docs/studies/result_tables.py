@@ -123,6 +123,14 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
 
 
+def name_once(rows: Sequence[Sequence[str]]) -> list[list[str]]:
+    """Return rows with an empty first cell if it is that of the row above."""
+    names = [row[0] for row in rows]
+    return [
+        ["" if name == above else name, *row[1:]] for name, above, row in zip(names, ["", *names], rows, strict=False)
+    ]
+
+
 def describe_measurement() -> str:
     """Return the line that precedes measured tables: today's date, the commit, and the command that runs."""
     commit, changes = _git("rev-parse", "--short=7", "HEAD"), _git("status", "--porcelain", "--", *CODE)
@@ -171,17 +179,11 @@ def list_stale() -> None:
 
 
 def write_index() -> None:
-    """Write the list of pages into the index, with the number of tables that are of today's code."""
-    blocks, studies, rows = read_blocks(), read_studies(), []
-    stale = {name for study in studies for name in study.stale(blocks)}
-    current = {name for study in studies for name in study.tables} - stale
-    for path in dict.fromkeys(blocks[name][0] for name in blocks if name in stale | current):
-        own = {name for name in stale | current if blocks[name][0] == path}
-        title = path.read_text(encoding="utf-8").splitlines()[0].removeprefix("# ")
-        rows.append([f"[{title}]({path.name})", str(len(own)), str(len(own & current))])
-    rows.append(["all", str(len(stale | current)), str(len(current))])
-    head = ["page", "tables", "of the code of this commit"]
-    _replace("pages", "", f"{describe_measurement()}\n\n{table(head, rows)}")
+    """Write the number of tables, and of those of today's code, into the index."""
+    blocks, studies = read_blocks(), read_studies()
+    total, stale = sum(len(study.tables) for study in studies), sum(len(study.stale(blocks)) for study in studies)
+    text = table(["tables", "of the code of this commit"], [[str(total), str(total - stale)]])
+    _replace("pages", "", f"{describe_measurement()}\n\n{text}")
 
 
 def main(*, run: bool = False, stale: bool = False, write: bool = False) -> int:

@@ -87,9 +87,9 @@ def main(folder: Path, *, write: bool = False) -> None:
     for name, values in figures.items():
         mean = np.mean(values, axis=0)
         cells = [f"{mean[0]:.3f}", f"{mean[1]:.4f}", f"{mean[2]:.3f}"]
-        rows.append([name, str(len(values)), *cells, *(f"{100 * share:.0f} %" for share in mean[5:])])
-    head = ["robot", "campaigns", "shift mm", "rotation deg", "held-out sphere relative to the robot's own error"]
-    head += ["within 95 % interval", "with the sensor taken as exact"]
+        rows.append([name, str(len(values)), *cells, *(f"{100 * share:.0f}" for share in mean[5:])])
+    head = ["robot", "campaigns", "shift mm", "rotation deg", "held-out sphere / own error"]
+    head += ["within 95 % interval, %", "sensor taken as exact, %"]
     publish({"mount by a robot": table(head, rows)}, write=write)
 
 

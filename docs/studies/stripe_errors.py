@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 from result_tables import publish, table
-from stripe_cases import CROSSING, FILTERED, MASS, VERTEX, measure
+from stripe_cases import measure
 from stripe_plan import NAME_CORE, PLACES, Plan
 
 from twin.rendering_options import use_variant
@@ -18,7 +18,6 @@ from uwlts.pages.toolkit import format_fixed
 from uwlts.runtime.console import progress_bar
 
 PICTURES = Path(__file__).parents[1] / "pictures"
-SHOWN = (CROSSING, MASS, "quadratic", FILTERED, VERTEX)
 
 
 def effects_table(plan: Plan) -> str:
@@ -34,12 +33,10 @@ def effects_table(plan: Plan) -> str:
 def unknown_table(plan: Plan) -> str:
     """Return a table of the spread in mm by changes of parameters unknown from the thesis."""
     cases, rows = plan.unknown(), []
-    head = [f"plane, {NAME_CORE}: std mm", *PLACES["plane"], *(f"stand-off, {name}" for name in (MASS, FILTERED))]
     for name in dict.fromkeys(name for name, _ in cases):
         values = [measure(cases[name, place]).spread().std_mm for place in PLACES["plane"]]
-        values += [measure(cases[name, "stand-off"]).spread(method).std_mm for method in (MASS, FILTERED)]
         rows.append([name, *(f"{value:.3f}" for value in values)])
-    return table(head, rows)
+    return table([f"plane, {NAME_CORE}: std mm", *PLACES["plane"]], rows)
 
 
 def main() -> None:

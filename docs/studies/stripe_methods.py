@@ -12,10 +12,10 @@ from functools import cache
 
 import numpy as np
 from circle_methods import circles_table
-from method_limits import bound_px, grain_px, spot_limit_px
-from method_shots import LEVELS, Place, Spread, places, render, round_to_zero
+from method_limits import bound_px, spot_limit_px
+from method_shots import LEVELS, Place, Spread, places, render
 from result_tables import publish, table
-from stripe_cases import FILTERED, MASS, METHODS
+from stripe_cases import MASS, METHODS
 
 from twin.rendering_options import use_variant
 from uwlts.runtime.console import progress_bar
@@ -27,7 +27,7 @@ ALL_METHODS = {
     FIT_FIVE: StripeOptions(method="profile-fit", smoothing_lines=5),
     **METHODS,
 }
-ONE_LINE = (FIT, MASS, "quadratic", CROSSING)
+ONE_LINE = (FIT, MASS, CROSSING)
 
 
 @cache
@@ -38,7 +38,7 @@ def spread(place: Place, method: str, frames: int, level: float = 1.0, speckle: 
         extract_stripe(shot_image(place, n, level, speckle), stripe_along="width", options=options).centre_px
         for n in range(frames)
     ]
-    return Spread.of(np.stack(found) - shot.truth_px, shot.mm_per_px, np.isfinite(shot.truth_px))
+    return Spread.of(np.stack(found) - shot.truth_px, shot.mm_per_px)
 
 
 @cache
@@ -49,23 +49,16 @@ def shot_image(place: Place, number: int, level: float, speckle: bool) -> np.nda
 
 def spread_table(frames: int) -> str:
     """Standard deviation in mm by method and place, with all effects."""
-    head = ["std in mm", *places()]
-    return table(
-        head, [[name, *(f"{spread(p, name, frames).std_mm:.4f}" for p in places().values())] for name in ALL_METHODS]
-    )
+    names = [name for name in ALL_METHODS if name != "quadratic"]
+    rows = [[name, *(f"{spread(p, name, frames).std_mm:.4f}" for p in places().values())] for name in names]
+    return table(["std in mm", *places()], rows)
 
 
 def exposure_table(frames: int) -> str:
-    """Bias and standard deviation in px by exposure, on the plane at the stand-off."""
-    place, rows = places()["plane, stand-off"], []
-    for level in LEVELS:
-        fit = spread(place, FIT, frames, level)
-        cells = [f"{level:g}", f"{100 * fit.found:.1f} %", _signed(fit.bias_px), f"{fit.std_px:.3f}"]
-        cells += [f"{spread(place, name, frames, level).std_px:.3f}" for name in (MASS, CROSSING, FILTERED)]
-        rows.append(cells)
-    head = ["exposure / automatic", "lines found", f"{FIT}: bias px", f"{FIT}: std px"]
-    head += [f"{name}: std px" for name in (MASS, CROSSING, FILTERED)]
-    return table(head, rows)
+    """Standard deviation in px by exposure, on the plane at the stand-off."""
+    place = places()["plane, stand-off"]
+    row = [f"{FIT}, std px", *(f"{spread(place, FIT, frames, level).std_px:.3f}" for level in LEVELS)]
+    return table(["exposure / automatic", *(f"{level:g}" for level in LEVELS)], [row])
 
 
 def limits_table(frames: int) -> str:
@@ -76,17 +69,12 @@ def limits_table(frames: int) -> str:
             continue
         shot = render(place)
         cells = [name, f"{bound_px(shot, speckle=False):.4f}"]
-        cells += [f"{spread(place, m, frames, 1.0, False).std_px:.4f}" for m in ONE_LINE if m != "quadratic"]
-        cells += [f"{grain_px(shot):.2f}", f"{spot_limit_px(shot):.3f}", f"{bound_px(shot, speckle=True):.3f}"]
-        cells += [f"{spread(place, m, frames).std_px:.3f}" for m in ONE_LINE if m != "quadratic"]
+        cells += [f"{spread(place, FIT, frames, 1.0, False).std_px:.4f}"]
+        cells += [f"{spot_limit_px(shot):.3f}", f"{bound_px(shot, speckle=True):.3f}"]
+        cells += [f"{spread(place, m, frames).std_px:.3f}" for m in ONE_LINE]
         rows.append(cells)
-    three = [m for m in ONE_LINE if m != "quadratic"]
-    head = ["plane, std px", "noise only: bound", *three, "speckle grain px", "limit of a spot", "limit of a line"]
-    return table([*head, *(f"all, {m}" for m in three)], rows)
-
-
-def _signed(value: float) -> str:
-    return f"{round_to_zero(value):+.3f}"
+    head = ["plane, std px", "bound by noise", f"{FIT}, noise only", "limit of a spot", "limit of a line"]
+    return table([*head, *ONE_LINE], rows)
 
 
 def main() -> None:

@@ -42,7 +42,6 @@ ROWS = {
     **{f"only {group}": exactly(*names) for group, names in GROUPS.items()},
     NAME_CORE: exactly(*CORE),
     NAME_ALL: ALL,
-    **{f"all but {group}": ALL.remove(*names) for group, names in GROUPS.items()},
 }
 
 
@@ -57,11 +56,10 @@ class Plan:
         return Case(**{"effects": effects, "frames": max(2, self.frames // 2) if walks else self.frames} | changes)
 
     def effects(self, thing: str) -> dict[tuple[str, str], Case]:
-        """Return cases by row and place; spheres have no rows with one effect left out."""
-        rows = {name: effects for name, effects in ROWS.items() if thing == "plane" or not name.startswith("all but")}
+        """Return cases by row and place."""
         return {
             (name, place): self.case(effects, thing=thing, z_mm=z)
-            for name, effects in rows.items()
+            for name, effects in ROWS.items()
             for place, z in PLACES[thing].items()
         }
 
@@ -85,7 +83,7 @@ class Plan:
             "scattered once": exactly("haze"),
             "scattered once or more often": ROWS["only scatter"],
             NAME_ALL: ALL,
-            "all but scatter": ROWS["all but scatter"],
+            "all but scatter": ALL.remove(*GROUPS["scatter"]),
         }
         return {
             (name, water): self.case(effects, water=water, frames=2, spp=16)

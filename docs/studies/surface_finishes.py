@@ -22,7 +22,7 @@ from twin.scene.surfaces import Finish
 from uwlts.radiometry.stripe_windows import STATISTICS, measure_windows, open_image_set
 
 PICTURE = Path(__file__).resolve().parents[1] / "pictures" / "surface-finishes.png"
-SHOWN = ("scatter", "correlation", "lowest", "gaps")
+SHOWN = ("scatter", "correlation")
 """Statistics of windows in the table."""
 FRAMES = 5
 _LINES, _HALF_PX = (240, 1040), 20
@@ -41,7 +41,7 @@ def cells_of(path: Path) -> list[str]:
     """Return the medians of the statistics of an image set's windows."""
     values = measure_windows(open_image_set(path), most_images=200).values
     columns = [values[:, [each.name for each in STATISTICS].index(name)] for name in SHOWN]
-    return [str(len(values)), *(f"{value:.2g}" for value in np.median(columns, axis=1))]
+    return [f"{value:.2g}" for value in np.median(columns, axis=1)]
 
 
 def main(*, real: tuple[str, ...] = (), write: bool = False) -> None:
@@ -66,16 +66,7 @@ def main(*, real: tuple[str, ...] = (), write: bool = False) -> None:
         rows.append([finish, *cells, f"{shift.mean():+.3f}", f"{shift.std():.3f}"])
         strips.append((finish, straighten(recording.images[0], recording.truth.centre_px[0])))
         print(rows[-1], flush=True)
-    head = [
-        "surface",
-        "windows",
-        "scatter, %",
-        "correlation",
-        "lowest, %",
-        "gaps, %",
-        "mean shift, px",
-        "scatter of the shift, px",
-    ]
+    head = ["surface", "scatter, %", "correlation", "mean shift, px", "scatter of the shift, px"]
     publish({"surfaces": table(head, rows)}, write=write)
     if write:
         draw(strips)

@@ -178,7 +178,7 @@ def main() -> None:
         f"{100 * min(within):.0f} to {100 * max(within):.0f} %",
     ]
     head = ["passes", "path before, rms mm", "after", "stated", f"factor (goal: {LEAST_FACTOR:g})"]
-    head += ["lengths between both passes of a crossing, rms mm", "coordinates within twice the stated"]
+    head += ["lengths across a crossing, rms mm", "within twice the stated"]
     publish({"vehicle passes": table(head, [row])}, write=given.write)
 
 

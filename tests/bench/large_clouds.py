@@ -1,39 +1,25 @@
 """Time and memory of commands on large clouds: ``python -m tests.bench.large_clouds [--write]``, 10^7 points each.
 
-The clouds are two scans of a pipe with pits, made with NumPy only, in files of 24 bytes per point. Each command runs
-alone in a process of its own.
+The clouds are two scans of a pipe with pits, made with NumPy only, in files of 24 bytes per point, and a ride.
+Each command runs alone in a process of its own.
 """
 
-import os
-import sys
 import tempfile
-import time
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from cyclopts import App
 
 from docs.studies.result_tables import publish, table
+from tests.bench.streams import RECONSTRUCT, run_alone, write_ride
 from tests.oracles.pipes import Bump, scan_pipe
 from uwlts.runtime.command_line import show
 
 _RADIUS_MM, _ARC, _NOISE_MM = 57.15, 1.2, 0.02
 _POINTS_AT_ONCE = 1_000_000
 """Points of a section of the pipe: the oracle makes several arrays of this size."""
+_POINTS_OF_PROFILE = 624
 _POINTS_PER_MM2 = 40.0
-
-
-@dataclass(frozen=True)
-class Cost:
-    """Cost of a command, and the most memory that it may take."""
-
-    command: str
-    seconds: float
-    processor_s: float
-    peak_gb: float
-    limit_gb: float
 
 
 def main(points: int = 10_000_000, *, write: bool = False) -> int:
@@ -50,7 +36,9 @@ def main(points: int = 10_000_000, *, write: bool = False) -> int:
         folder = Path(name)
         for seed, cloud in enumerate(("before.ply", "after.ply")):
             _write_pipe(folder / cloud, points, seed=seed)
+        write_ride(folder, points // _POINTS_OF_PROFILE)
         commands = (
+            (RECONSTRUCT, 4.0),
             ("uwlts export after.ply --out after.laz", 4.0),
             ("uwlts inspect after.ply --wall-mm 9.5 --out after.json", 4.0),
             ("uwlts compare after.ply before.ply --out change.html", 8.0),
@@ -59,13 +47,13 @@ def main(points: int = 10_000_000, *, write: bool = False) -> int:
         )
         missed, rows = 0, []
         for line, limit_gb in commands:
-            cost = _run(line, folder, limit_gb)
+            cost = run_alone(line, folder, limit_gb)
             kept = cost.peak_gb <= cost.limit_gb
             missed += not kept
             memory = f"{cost.peak_gb:.1f} GB", f"{cost.limit_gb:g} GB{'' if kept else ', missed'}"
-            rows.append([f"`{line}`", f"{cost.processor_s:.0f} s", f"{cost.seconds:.0f} s", *memory])
+            rows.append([f"`{line}`", f"{cost.processor_s:.0f} s", *memory])
             show([" ".join(rows[-1])])
-    head = ["command", "processor time", "time", "peak memory", "limit"]
+    head = ["command", "processor time", "peak memory", "limit"]
     publish({"large clouds": table(head, rows)}, write=write)
     return 1 if missed else 0
 
@@ -99,26 +87,6 @@ def _write_pipe(path: Path, points: int, *, seed: int) -> None:
     head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n"
     head += "".join(f"property double {axis}\n" for axis in "xyz") + "end_header\n"
     path.write_bytes(head.encode() + rows.astype("<f8").tobytes())
-
-
-def _run(line: str, folder: Path, limit_gb: float) -> Cost:
-    """Run a command and return its cost; ends with its exit code if it fails."""
-    program, *arguments = line.split()
-    command: Sequence[str] = [sys.executable, "-m", program, *arguments, "--quiet"]
-    environment = os.environ | {"PYTHONPATH": str(Path.cwd()), "OPENBLAS_NUM_THREADS": "1"}
-    start, own = time.perf_counter(), Path.cwd()
-    os.chdir(folder)
-    try:
-        child = os.posix_spawn(sys.executable, command, environment)
-    finally:
-        os.chdir(own)
-    _, status, usage = os.wait4(child, 0)
-    if code := os.waitstatus_to_exitcode(status):
-        sys.exit(code)
-    # ru_maxrss is in KiB.
-    return Cost(
-        line, time.perf_counter() - start, usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024 / 1e9, limit_gb
-    )
 
 
 if __name__ == "__main__":

@@ -79,7 +79,7 @@ def test_pixels_and_tangential_distortion_are_found_in_flawed_photographs(thesis
     corners = [len(photograph.pixels) for photograph in found.photographs]
     assert sum(count < 15 * 8 for count in corners) >= 8, "boards are cut off"
     values, std = found.lens.values(), found.lens.std()
-    assert {"fx", "fy", "p1"} <= values.keys(), f"the lens is taken for one of {found.lens.name}"
+    assert {"fx", "fy", "p1"} <= values.keys(), f"the lens is taken for one of {found.lens.options.name}"
     (fx, fy), (cx, cy) = camera.focal_lengths_px(), camera.principal_point()
     true = {"fx": fx, "fy": fy, "cx": cx, "cy": cy} | camera.distortion.model_dump()
     off = {name: (values[name] - true[name]) / std[name] for name in values}

@@ -149,12 +149,10 @@ def test_daylight_stays_when_the_laser_is_off(served, stage, camera):
 def test_at_rest_only_the_noise_is_new(served, stage, camera):
     stage.move_to(served.track.start_mm + 1, feed_mm_per_min=FEED)
     start(camera, served.exposure_ms["laser"])
-    before = served.rates()
+    before = served.bench.frames, served.bench.renderings
     images = [grab_lit(camera, stage) for _ in range(5)]
-    rates = served.rates()
-    assert (rates.frames - before.frames, rates.rendered - before.rendered) == (5, 1)
+    assert (served.bench.frames - before[0], served.bench.renderings - before[1]) == (5, 1)
     assert all(not np.array_equal(a, b) for a, b in pairwise(images))
-    assert re.fullmatch(r"\d+ frames, \d+ rendered at .* frames/s, \d+ at the same position at .* frames/s", str(rates))
 
 
 def test_a_laser_that_breaks_leaves_the_dark(served, stage, camera):
@@ -327,5 +325,5 @@ def test_the_command_serves_until_it_is_interrupted(folder: Path, served):
         command.communicate()
         served.camera.connect()
     assert (command.returncode, errors) == (0, "")
-    assert output.startswith("ended after 1 frames, 1 rendered at ")
+    assert output == "ended after 1 frames\n"
     assert not Path(port).exists()

@@ -101,7 +101,7 @@ _LOOKS_FOR_TRIGGER_HZ = 200.0
 # Hosts repeat a command without an answer after 500 ms.
 _LONGEST_WAIT_S = 0.1
 _NAME_BYTES = 32
-_SERIAL_BYTES = 16
+_SERIAL, _SERIAL_BYTES = b"1", 16
 # Frame numbers have 16 bits and skip 0.
 _LAST_NUMBER = 2**16 - 1
 # In a "cut" frame, every tenth packet is lost, at least one, but not the first, which announces the frame.
@@ -175,7 +175,7 @@ class GigeCamera:
 
     ``frame(exposure_ms)`` returns the whole image (height_px, width_px), uint8; all calls are in the same thread. If it
     raises an exception, the frame is lost and the exception is kept in ``failure``. A trigger that arrives during the
-    making of an image replaces the previous trigger, which is not answered. Frames are numbered from ``first_number``.
+    making of an image replaces the previous trigger, which is not answered.
 
     With ``scan3d`` it is a 3D camera: its pixel format is Coord3D_C16 until a program selects Mono8. Each frame
     contains the profile of an image, with 0 for no stripe. A free-running camera sends ``Height`` profiles together.
@@ -194,18 +194,13 @@ class GigeCamera:
         *,
         width_px: int = 1280,
         height_px: int = 1024,
-        serial: str = "1",
-        first_number: int = 1,
         scan3d: "PeakFinder | None" = None,
         encoder: Callable[[], int] | None = None,
         expose: Callable[[], ExposedFrame] | None = None,
     ):
-        if not serial.isascii() or not 0 < len(serial) < _SERIAL_BYTES:
-            raise HardwareError(f"serial is '{serial}': it must have 1 to {_SERIAL_BYTES - 1} ASCII characters")
         self.failure: BaseException | None = None
         self._frame, self._scan3d, self._encoder, self._expose = frame, scan3d, encoder, expose
         self._size = (height_px, width_px)
-        self._serial = serial.encode()
         self._library = _functions()
         # The library does not keep a reference to the callback.
         self._callback = _FILL(self._fill)
@@ -213,7 +208,7 @@ class GigeCamera:
         self._lock = threading.Lock()
         self._faults: Counter[str] = Counter()
         self._delay_s = 0.0
-        self._number = first_number - 1
+        self._number = 0
         self._making: Future[_Shot] | None = None
         self._answer: _Shot | None = None
         self._last: _Shot | None = None
@@ -276,7 +271,7 @@ class GigeCamera:
                 features.write(self._features())
                 features.flush()
                 interface, name = LOOPBACK.encode(), features.name.encode()
-                self._server = library.arv_gv_fake_camera_new_full(interface, self._serial, name)
+                self._server = library.arv_gv_fake_camera_new_full(interface, _SERIAL, name)
         if not library.arv_gv_fake_camera_is_running(self._server):
             self.disconnect()
             raise HardwareError(
@@ -292,7 +287,7 @@ class GigeCamera:
         memory = {
             _Register.MAKER: b"UWLTS".ljust(_NAME_BYTES, b"\0"),
             _Register.MODEL: b"Twin".ljust(_NAME_BYTES, b"\0"),
-            _Register.DEVICE_ID: self._serial.ljust(_SERIAL_BYTES, b"\0"),
+            _Register.DEVICE_ID: _SERIAL.ljust(_SERIAL_BYTES, b"\0"),
         }
         numbers = {
             _Register.SENSOR_WIDTH: width,
@@ -315,7 +310,7 @@ class GigeCamera:
     def _features(self) -> bytes:
         """Return the XML of the camera's features: Aravis's fake camera, with those of a 3D camera or encoder."""
         library, size = self._library, c_size_t()
-        usual = library.arv_fake_camera_new(self._serial)
+        usual = library.arv_fake_camera_new(_SERIAL)
         described = ctypes.string_at(library.arv_fake_camera_get_genicam_xml(usual, ctypes.byref(size)), size.value)
         library.g_object_unref(usual)
         # The standard's name of the exposure (GenICam SFNC 2.7).

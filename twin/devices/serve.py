@@ -7,7 +7,6 @@ import math
 import re
 import signal
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -22,7 +21,7 @@ from twin.recording.render import AnyScene, choose_scene
 from twin.rendering_options import CPU, Options, Variant, use_variant
 from twin.scene.campaign import AnySensor, choose_sensors
 from twin.scene.description import replace_values
-from twin.scene.platforms import Light, Motion, Shot
+from twin.scene.platforms import Light, Motion, Platform, Shot
 from uwlts.errors import DescriptionError, DesignError
 from uwlts.model.sensor import Stage
 
@@ -119,11 +118,13 @@ class Track:
     start_mm: float
 
     @classmethod
-    def place(cls, stage: Stage, motion: Motion, *, start_mm: float | None = None) -> "Track":
+    def place(cls, stage: Stage, motion: Motion | Platform, *, start_mm: float | None = None) -> "Track":
         """Place a motion at ``start_mm``, by default in the middle of the travel, rounded to a step.
 
-        Raises DescriptionError if the motion is not within the travel.
+        Raises DescriptionError if the motion is not one of the stage, or not within the travel.
         """
+        if not isinstance(motion, Motion):
+            raise DescriptionError(f"the scene moves on a {motion.kind}; expected one with a motion of the stage")
         way_mm = (motion.count - 1) * motion.step_mm
         if start_mm is None:
             start_mm = round((stage.travel_mm - way_mm) / 2 / stage.resolution_mm) * stage.resolution_mm
@@ -152,37 +153,24 @@ class Track:
         return Shot(stage_mm=scene_mm, travelled_mm=scene_mm + error_mm, light=light)
 
 
-@dataclass(frozen=True)
-class FrameRates:
-    """Numbers of all frames and of rendered frames, and times in s of rendered and repeated frames."""
-
-    frames: int = 0
-    rendered: int = 0
-    rendering_s: float = 0.0
-    repeating_s: float = 0.0
-
-    def __str__(self) -> str:
-        repeated = self.frames - self.rendered
-        parts = [f"{self.frames} frames"]
-        if self.rendered:
-            parts.append(f"{self.rendered} rendered at {self.rendered / self.rendering_s:.1f} frames/s")
-        if repeated:
-            parts.append(f"{repeated} at the same position at {repeated / self.repeating_s:.1f} frames/s")
-        return ", ".join(parts)
-
-
 class Bench:
     """Renderer of frames for a stage; used by one thread.
 
     ``state()`` returns the present true state of the stage, and ``track`` is the position of the scene's motion on it.
-    With ``lamp``, the lamp is on while the laser is off. Raises DesignError if the detector does not have 8 bits.
+    With ``lamp``, the lamp is on while the laser is off. ``frames`` are counted, and ``renderings`` of their light; at
+    rest it is kept. Raises DesignError if the detector does not have 8 bits, or the profile lines of a 3D camera are
+    not its columns.
     """
 
     def __init__(self, simulator: "SensorSimulator", *, state: Callable[[], StageState], track: Track, lamp: bool):
         bits = simulator.sensor.detector.bits
         if bits != 8:
             raise DesignError(f"the served camera has 8 bits, the sensor's detector {bits}: set bits = 8")
-        self.rates = FrameRates()
+        if simulator.peak_finder is not None and simulator.sensor.camera.stripe_along != "width":
+            raise DesignError(
+                "the profile lines of a 3D camera are its columns: use a sensor with stripe_along = 'width'"
+            )
+        self.frames = self.renderings = 0
         self._simulator, self._state, self._track, self._lamp = simulator, state, track, lamp
         self._travelled_mm = math.nan
         self._seen: dict[str, np.ndarray] = {}
@@ -192,32 +180,24 @@ class Bench:
         state = replace(self._state(), laser_on=True, power=1.0)
         light = self._electrons_per_ms(state, None)
         self._simulator.detect(exposure_ms * light, exposure_ms=exposure_ms, noise_seed=[self._simulator.options.seed])
-        self._travelled_mm = math.nan
+        self._travelled_mm, self.renderings = math.nan, 0
 
     def frame(self, exposure_ms: float, state: StageState | None = None) -> np.ndarray:
         """Render the image (height_px, width_px), uint8, of a state, by default the present one.
 
         A given state includes motion blur. The noise is different in each call.
         """
-        began, known, travel = time.perf_counter(), len(self._seen), None
+        travel = None
         if state is not None and state.moving and self._simulator.options.effects.motion:
             velocity = state.speed_mm_per_s * self._track.motion.unit_direction()
             travel = self._simulator.travel_at(velocity, np.zeros(3), exposure_ms=exposure_ms)
-        state = state or self._state()
+            self._seen.clear()
+        light = exposure_ms * self._electrons_per_ms(state or self._state(), travel)
         if travel is not None:
             self._seen.clear()
-        at_rest = self._track.shot(state.position_mm, "laser").travelled_mm == self._travelled_mm
-        light = exposure_ms * self._electrons_per_ms(state, travel)
-        if travel is not None:
-            self._seen.clear()
-        noise_seed = [self._simulator.options.seed, _NOISE, self.rates.frames]
-        image = self._simulator.detect(light, exposure_ms=exposure_ms, noise_seed=noise_seed)
-        seconds, rates = time.perf_counter() - began, replace(self.rates, frames=self.rates.frames + 1)
-        if at_rest and len(self._seen) == known:
-            self.rates = replace(rates, repeating_s=rates.repeating_s + seconds)
-        else:
-            self.rates = replace(rates, rendered=rates.rendered + 1, rendering_s=rates.rendering_s + seconds)
-        return image
+        noise_seed = [self._simulator.options.seed, _NOISE, self.frames]
+        self.frames += 1
+        return self._simulator.detect(light, exposure_ms=exposure_ms, noise_seed=noise_seed)
 
     def _electrons_per_ms(self, state: StageState, travel: "Travel | None") -> np.ndarray:
         """Return mean photo-electrons per ms (H, W), without noise; those of the latest position are kept."""
@@ -239,19 +219,20 @@ class Bench:
             # Position in whole um as a non-negative seed.
             place = round(1e3 * shot.travelled_mm) % 2**32
             seed = int(np.random.SeedSequence([options.seed, _WALKS, place]).generate_state(1)[0])
+            self.renderings += 1
             self._seen[light] = self._simulator.electrons_per_ms(shot, spp=options.spp, seed=seed, travel=travel)
         return self._seen[light]
 
 
 @dataclass(frozen=True)
 class ServedTwin:
-    """Served stage and camera, position of the scene on the stage, and suitable exposures in ms."""
+    """Served stage and camera, position of the scene on the stage, suitable exposures in ms, and the bench."""
 
     controller: GrblController
     camera: GigeCamera
     track: Track
     exposure_ms: dict[str, float]
-    rates: Callable[[], FrameRates]
+    bench: Bench
 
     def lines(self) -> list[str]:
         """Return ports, motion and exposures as lines of text."""
@@ -359,16 +340,13 @@ def serve(
         raise DescriptionError("lamp-and-laser cannot be served, because the controller switches the laser: remove it")
     if not speed_up > 0:
         raise DescriptionError(f"speed_up is {speed_up:g}; it must be positive")
-    if not isinstance(motion := described.motion, Motion):
-        moves = f"{described.title} moves on a {motion.kind}"
-        raise DescriptionError(f"{moves}; expected a scene with a motion of the stage")
     _, built = choose_sensors(sensor, as_built)
     faults = [parse_fault(text) for text in fault]
+    track = Track.place(built.stage, described.motion, start_mm=stage_start)
     use_variant(variant)
     from twin.recording.sensor_simulator import SensorSimulator
 
-    track = Track.place(built.stage, motion, start_mm=stage_start)
-    lamp = "lamp" in motion.lights if lamp is None else lamp
+    lamp = "lamp" in track.motion.lights if lamp is None else lamp
     # The controller moves the stage, and a frame can need any light.
     at_rest = {"lights": ("lamp", "laser") if lamp else ("laser",), "speed_mm_per_s": 0.0}
     simulator = SensorSimulator(built, replace_values(described, motion=at_rest), options)
@@ -391,9 +369,6 @@ def serve(
         inject(number + 1, ahead=True)
         return image
 
-    if simulator.peak_finder is not None and built.camera.stripe_along != "width":
-        raise DesignError("the profile lines of a 3D camera are its columns: use a sensor with stripe_along = 'width'")
-
     def expose() -> ExposedFrame:
         state = controller.state()
 
@@ -415,4 +390,4 @@ def serve(
     inject(1, ahead=True)
     bench.prepare(simulator.exposure_ms["laser"])
     with controller, camera:
-        yield ServedTwin(controller, camera, track, simulator.exposure_ms, lambda: bench.rates)
+        yield ServedTwin(controller, camera, track, simulator.exposure_ms, bench)

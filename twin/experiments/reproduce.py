@@ -9,7 +9,7 @@ target in water, then also half of the scans of spheres in water, which were rec
 not used. The errors are those of the other half, and of all scans in air.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,15 +27,12 @@ _IN_AIR = tuple(f"spheres-{place}{again}-air" for place in _PLACES for again in 
 _HELD_OUT = (*(f"spheres-{place}-2-water" for place in _PLACES), *_IN_AIR)
 _BOTH = ("target-bare", "target-air")
 _IN_WATER = {"air": _BOTH, "water": ("target-water",), "step": _STEPS}
+_ONE = Method("one refraction", {"air": ("target-air",), "step": _STEPS}, (), "--refractions 1", "-one-refraction")
+_TWO = Method("two refractions", {"air": ("target-bare",), "step": _STEPS}, (), "--refractions 2", "-two-refractions")
+"""The thesis's two methods, without scans."""
 METHODS = (
-    Method("one refraction", {"air": ("target-air",), "step": _STEPS}, _HELD_OUT, "--refractions 1", "-one-refraction"),
-    Method(
-        "two refractions",
-        {"air": ("target-bare",), "step": _STEPS},
-        [scan for scan in _HELD_OUT if scan not in _IN_AIR],
-        "--refractions 2",
-        "-two-refractions",
-    ),
+    replace(_ONE, scans=_HELD_OUT),
+    replace(_TWO, scans=[scan for scan in _HELD_OUT if scan not in _IN_AIR]),
     Method("joint, same evidence", {"air": _BOTH, "step": _STEPS}, _HELD_OUT, "--joint", "-joint-same-evidence"),
     Method("joint, with the target in water", _IN_WATER, _HELD_OUT, "--joint", "-joint-with-target-in-water"),
     Method(
@@ -59,11 +56,10 @@ _SPHERES, _PLANES, _FORMS = (
     )
 )
 _ALL = {medium: [*_SPHERES[medium], *_PLANES[medium], *_FORMS[medium]] for medium in _MEDIA}
-_ONE: Mapping[str, Sequence[str]] = {"air": ("target-air",), "step": _STEPS}
 _STUDY = {"step": _STEPS, "spheres": _SPHERES["water"], "line": ("line-width", "line-height")}
 _CALIBRATIONS = (
-    Method("one refraction", _ONE, [*_ALL["air"], *_ALL["water"]], "--refractions 1", "-one-refraction"),
-    Method("two refractions", {"air": ("target-bare",), "step": _STEPS}, _ALL["water"], "", "-two-refractions"),
+    replace(_ONE, scans=[*_ALL["air"], *_ALL["water"]]),
+    replace(_TWO, scans=_ALL["water"]),
     *(
         Method("polynomials", {"captures": (f"target-{each}",)}, _ALL[each], "", f"-polynomials-{each}", "polynomials")
         for each in _MEDIA
@@ -162,25 +158,9 @@ def reproduce(
 
 _DEMO_SPHERES = tuple(f"spheres-{place}" for place in _PLACES)
 DEMO_METHODS = (
-    Method(
-        "joint",
-        {"air": ("target-bare", "target-air"), "water": ("target-water",), "step": _STEPS},
-        (*_DEMO_SPHERES, "step-scan", "pipe"),
-    ),
-    Method(
-        "two refractions",
-        {"air": ("target-bare",), "step": _STEPS},
-        _DEMO_SPHERES,
-        options="--refractions 2",
-        suffix="-two-refractions",
-    ),
-    Method(
-        "one refraction",
-        {"air": ("target-air",), "step": _STEPS},
-        _DEMO_SPHERES,
-        options="--refractions 1",
-        suffix="-one-refraction",
-    ),
+    Method("joint", _IN_WATER, (*_DEMO_SPHERES, "step-scan", "pipe")),
+    replace(_TWO, scans=_DEMO_SPHERES),
+    replace(_ONE, scans=_DEMO_SPHERES),
 )
 """The joint calibration, and both methods of the thesis."""
 

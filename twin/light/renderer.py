@@ -504,10 +504,10 @@ class Renderer:
     def _select_lines(
         self, lines: np.ndarray, rows: np.ndarray, columns: np.ndarray, means: np.ndarray
     ) -> tuple[np.ndarray, ...]:
-        known = np.isfinite(lines[0, self._line_numbers(rows, columns), 0])
+        known = np.isfinite(lines[0, self._find_line_numbers(rows, columns), 0])
         return rows[known], columns[known], means[:, known]
 
-    def _line_numbers(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    def _find_line_numbers(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         return columns if self.sensor.camera.stripe_along == "width" else rows
 
     def _render_stripe(
@@ -536,7 +536,7 @@ class Renderer:
             for part in split_pixels(rows[where], columns[where], spp=spp):
                 if found:
                     dr.sync_thread()  # limits memory to the samples of one part
-                of_pixels = None if planes is None else to_jit(planes[self._line_numbers(*part)])
+                of_pixels = None if planes is None else to_jit(planes[self._find_line_numbers(*part)])
                 found.append(self._pixels.render(self._surfaces.sums, pose, *part, sources, of_pixels, spp=spp))
             return lambda: np.concatenate([np.zeros((count, 0), np.float32), *(means() for means in found)], axis=1)
 

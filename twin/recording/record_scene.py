@@ -18,7 +18,7 @@ from twin.rendering_options import Options
 from twin.scene.description import Scene, medium_of
 from twin.scene.platforms import Platform, Shot
 from uwlts.errors import OutputError
-from uwlts.model.sensor import Sensor, Table
+from uwlts.model.sensor import Sensor, Table, to_rows
 from uwlts.model.trajectory import Trajectory
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import CaptureHeader
@@ -61,7 +61,7 @@ def record_scene(
         medium_name=scene.medium,
         medium=medium_of(sensor, scene),
         stage_direction=(1.0, 0.0, 0.0) if isinstance(motion, Platform) else motion.recorded_direction(),
-        T_platform_sensor=tuple(map(tuple, motion.mount.matrix().tolist())) if isinstance(motion, Platform) else None,
+        T_platform_sensor=to_rows(motion.mount.matrix()) if isinstance(motion, Platform) else None,
         saturation_dn=sensor.detector.full_scale_dn(),
         target=scene.target,
         artefact=scene.artefact,

@@ -205,9 +205,9 @@ class SensorSimulator:
 
     def electrons_per_ms(self, shot: Shot, *, spp: int, seed: int, travel: Travel | None = None) -> np.ndarray:
         """Return the mean photo-electrons per ms (H, W) of a shot."""
-        return self._electrons_per_ms(*self._light(shot, spp=spp, seed=seed, travel=travel), shot)
+        return self._electrons_per_ms(*self._render_light(shot, spp=spp, seed=seed, travel=travel), shot)
 
-    def _light(
+    def _render_light(
         self,
         shot: Shot,
         *,
@@ -234,7 +234,7 @@ class SensorSimulator:
     def _electrons_per_ms(
         self, even: np.ndarray, laser: LaserFrame | None, shot: Shot, *, speckle: bool = True
     ) -> np.ndarray:
-        """Return the mean photo-electrons per ms (H, W) of the light from `_light`, with speckle if it is enabled."""
+        """Return mean photo-electrons per ms (H, W) of light from `_render_light`, with speckle if it is enabled."""
         light = self._apply_lens(even)
         if laser is not None:
             seen = self._apply_lens(self._add_speckle(laser, shot) if speckle else laser.irradiance())
@@ -275,7 +275,7 @@ class SensorSimulator:
         self._shift_points(shot, index)
         self._crossings = None
         seed = int(np.random.SeedSequence([self.options.seed, index]).generate_state(1)[0])
-        return self._light(
+        return self._render_light(
             shot,
             spp=self.options.spp,
             seed=seed,
@@ -411,7 +411,7 @@ class SensorSimulator:
         for shot in dict.fromkeys((shots[len(shots) // 2], shots[0], shots[-1])):
             if probe == "middle" and brightest > 0:
                 break
-            even, laser = self._light(shot, spp=PROBE_SPP, seed=0, travel=None)
+            even, laser = self._render_light(shot, spp=PROBE_SPP, seed=0, travel=None)
             # If one shot suffices, skip its speckle, which would double the time.
             peaks = self._electrons_per_ms(even, laser, shot, speckle=probe == "scan").max(axis=axis)
             reference = np.sort(peaks)[-1 - min(STRAY_LINES, len(peaks) - 1)]

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import BeforeValidator, Discriminator, Field, SerializeAsAny, Tag, model_validator
 
 from twin.scene.forms import AnyForm
-from twin.scene.platform_kinds import LinearGuide, Robot, RotaryTable, Vehicle
+from twin.scene.platform_kinds import Robot, RotaryTable, Vehicle
 from twin.scene.platforms import IdealPath, Motion, Platform
 from twin.scene.scene_object import FlatObject, Pose, Reflectance, SceneObject
 from uwlts.errors import DescriptionError
@@ -216,7 +216,6 @@ def _kind_of_motion(motion: object) -> str:
 AnyMotion = Annotated[
     Annotated[Motion, Tag("")]
     | Annotated[IdealPath, Tag("path")]
-    | Annotated[LinearGuide, Tag("linear_guide")]
     | Annotated[RotaryTable, Tag("rotary_table")]
     | Annotated[Robot, Tag("robot")]
     | Annotated[Vehicle, Tag("vehicle")],

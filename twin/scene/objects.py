@@ -207,57 +207,72 @@ def _arrange_by_registry(shapes: list[mi.Shape], values: np.ndarray) -> Float:
 
 
 def _shape(thing: AnyObject, pose: np.ndarray, bsdf: mi.BSDF, *, seed: tuple[int, ...]) -> mi.Shape:
-    """Return the shape of an object at its pose (4, 4) in the scene; ``seed`` is that of its relief.
+    """Return the shape of an object at its pose (4, 4) in the scene; ``seed`` is that of its relief."""
+    surface = _triangulate(thing)
+    if surface is None:
+        assert not isinstance(thing, Mesh | FreeForm)
+        kind, matrix = _place_primitive(thing, pose)
+        return mi.load_dict({"type": kind, "to_world": mi.ScalarTransform4f(matrix), "bsdf": bsdf})
+    if thing.finish_properties().relief_mm > 0:
+        surface = add_relief(surface, thing.finish_properties(), np.random.default_rng(seed))
+    return _mesh(surface, pose, mi.load_dict({"type": "twosided", "bsdf": bsdf}) if _is_two_sided(thing) else bsdf)
+
+
+def _triangulate(thing: AnyObject) -> tuple[np.ndarray, ...] | None:
+    """Return the mesh of an object in its own frame, as for `_mesh`; None if one of Mitsuba's primitives shows it.
 
     Under a relief, facets of spheres and pipes deviate by less than 2e-4 of the diameter.
     """
-    rough, matrix, kind = thing.finish_properties().relief_mm > 0, pose, ""
-    surface: tuple[np.ndarray, ...] = ()  # vertices (V, 3), faces (F, 3) and, of some, texture coordinates (V, 2)
+    rough = thing.finish_properties().relief_mm > 0
     match thing:
         case Mesh():
-            surface = _surface_from_file(thing)
+            return _surface_from_file(thing)
         case FreeForm():
-            surface = thing.surface()
-        case Ball() if rough:
-            ball = trimesh.creation.icosphere(subdivisions=5, radius=thing.diameter_mm / 2)
-            surface = ball.vertices, ball.faces
-        case Ball():
-            matrix = pose.copy()
-            if thing.texture is None:
-                matrix[:3, :3] = np.eye(3)  # Mitsuba mistakes rounding errors of a rotated sphere for shear
-            matrix, kind = matrix @ _make_scaling(*[thing.diameter_mm / 2] * 3), "sphere"
+            return thing.surface()
+        case CirclePlate() | TargetPlate() if thing.bow_mm != 0:
+            return bowed_plate(*thing.bounds_mm(), bow_mm=thing.bow_mm)
         case Block() if thing.edge_radius_mm > 0:
-            surface = rounded_box(np.array(thing.size_mm), radius_mm=thing.edge_radius_mm)
+            return rounded_box(np.array(thing.size_mm), radius_mm=thing.edge_radius_mm)
         case Block() if rough:
             box = trimesh.creation.box(thing.size_mm)
-            surface = box.vertices, box.faces
-        case Block():
-            matrix, kind = pose @ _make_scaling(*(side / 2 for side in thing.size_mm)), "cube"
+            return box.vertices, box.faces
+        case Ball() if rough:
+            ball = trimesh.creation.icosphere(subdivisions=5, radius=thing.diameter_mm / 2)
+            return ball.vertices, ball.faces
         case Pipe() if rough:
             around = np.linspace(0, 2 * np.pi, 360, endpoint=False)
-            surface = tube(np.array([-0.5, 0.5]) * thing.length_mm, around, np.full((2, 360), thing.diameter_mm / 2))
+            return tube(np.array([-0.5, 0.5]) * thing.length_mm, around, np.full((2, 360), thing.diameter_mm / 2))
+        case Plate() if rough:
+            half = np.array([thing.width_mm, thing.height_mm]) / 2
+            return bowed_plate(-half, half, bow_mm=0.0, cells=1)
+    return None
+
+
+def _place_primitive(
+    thing: Ball | Block | Pipe | CirclePlate | TargetPlate | Plate, pose: np.ndarray
+) -> tuple[str, np.ndarray]:
+    """Return the name of Mitsuba's primitive for an object, and its transform (4, 4) to the scene."""
+    match thing:
+        case Ball():
+            if thing.texture is None:
+                # Mitsuba mistakes rounding errors of a rotated sphere for shear.
+                pose = np.block([[np.eye(3), pose[:3, 3:]], [pose[3:]]])
+            return "sphere", pose @ _make_scaling(*[thing.diameter_mm / 2] * 3)
+        case Block():
+            return "cube", pose @ _make_scaling(*(side / 2 for side in thing.size_mm))
         case Pipe():
             matrix = _CYLINDER_AXIS_TO_X @ _make_scaling(thing.diameter_mm / 2, thing.diameter_mm / 2, thing.length_mm)
             matrix[0, 3] = -thing.length_mm / 2
-            matrix, kind = pose @ matrix, "cylinder"
-        case CirclePlate() | TargetPlate() if thing.bow_mm != 0:
-            surface = bowed_plate(*thing.bounds_mm(), bow_mm=thing.bow_mm)
+            return "cylinder", pose @ matrix
         case CirclePlate() | TargetPlate():
             first, last = thing.bounds_mm()
             matrix = _FACING_SENSOR @ _make_scaling(*(last - first) / 2, 1)
             matrix[:2, 3] = (first + last) / 2
-            matrix, kind = pose @ matrix, "rectangle"
+            return "rectangle", pose @ matrix
         case Plate():
-            half = np.array([thing.width_mm, thing.height_mm]) / 2
-            surface = bowed_plate(-half, half, bow_mm=0.0, cells=1) if rough else ()
-            matrix, kind = pose @ _FACING_SENSOR @ _make_scaling(*half, 1), "rectangle"
+            return "rectangle", pose @ _FACING_SENSOR @ _make_scaling(thing.width_mm / 2, thing.height_mm / 2, 1)
         case _:
             assert_never(thing)
-    if surface:
-        if rough:
-            surface = add_relief(surface, thing.finish_properties(), np.random.default_rng(seed))
-        return _mesh(surface, pose, mi.load_dict({"type": "twosided", "bsdf": bsdf}) if _is_two_sided(thing) else bsdf)
-    return mi.load_dict({"type": kind, "to_world": mi.ScalarTransform4f(matrix), "bsdf": bsdf})
 
 
 def _is_two_sided(thing: AnyObject) -> bool:

@@ -13,16 +13,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from twin.scene.platforms import (
-    LEAD_S,
-    SPOT_MM,
-    Platform,
-    PlatformMotion,
-    Route,
-    displace_poses,
-    find_stop,
-    interpolate_values,
-)
+from twin.scene.platforms import LEAD_S, Platform, PlatformMotion, Route, displace_poses, find_stop, interpolate_values
 from twin.scene.scene_object import Pose
 from uwlts.errors import DescriptionError
 from uwlts.model.sensor import Description, NotNegative, Positive, Vector
@@ -181,54 +172,7 @@ class Vehicle(Route):
         return PlatformMotion(true, lambda times: displace_poses(true(times), errors(times)), covariance)
 
 
-# --- linear guide and rotary table ------------------------------------------------------------------------------------
-
-
-class LinearGuide(Route):
-    """A linear guide from the first to the last waypoint, with the error motions of ISO 230-1:2012, 3.4.
-
-    Error motions are ranges over the travel, in um of the carriage (the platform's origin) and in arcsec of its
-    rotation. X is the guide's axis, and Z is as close to the scene's Z as possible. ``positioning_um`` (EXX) is along
-    the guide and ``straightness_um`` is across it (EYX) and perpendicular to both (EZX); ``roll``, ``pitch`` and
-    ``yaw`` are EAX, EBX, ECX. Each is a sum of waves of 1 to 4 periods over the travel, as bent rails cause. A screw of
-    ``pitch_mm`` adds a periodic error with the amplitude ``periodic_um`` to EXX. The encoder reports the nominal
-    position.
-    """
-
-    kind: Literal["linear_guide"]
-    positioning_um: NotNegative = 0.0
-    straightness_um: tuple[NotNegative, NotNegative] = (0.0, 0.0)
-    roll_arcsec: NotNegative = 0.0
-    pitch_arcsec: NotNegative = 0.0
-    yaw_arcsec: NotNegative = 0.0
-    periodic_um: NotNegative = 0.0
-    pitch_mm: Positive = 5.0
-
-    @model_validator(mode="after")
-    def _check_straight(self) -> "LinearGuide":
-        places = np.array([waypoint.position_mm for waypoint in self.waypoints])
-        if len(places) < 2 or np.linalg.norm(places[-1] - places[0]) < SPOT_MM:
-            raise ValueError("a linear guide needs two or more waypoints; the last must differ from the first")
-        return self
-
-    def draw_motion(self, rng: np.random.Generator) -> PlatformMotion:
-        commanded = self.command_poses()
-        first, last = (self.waypoints[end].matrix()[:3, 3] for end in (0, -1))
-        travel = float(np.linalg.norm(last - first))
-        guide = _axes((last - first) / travel)
-        ranges = np.array([self.positioning_um, *self.straightness_um]) * 1e-3
-        turns = np.radians(np.array([self.roll_arcsec, self.pitch_arcsec, self.yaw_arcsec]) / 3600)
-        bends = [_draw_bend(size, rng) for size in (*ranges, *turns)]
-        begun, phase = commanded(np.zeros(1))[0, :3, 3], rng.uniform(0, 2 * np.pi)
-
-        def true(times: np.ndarray) -> np.ndarray:
-            poses = commanded(times)
-            along = (poses[:, :3, 3] - begun) @ guide[:, 0]
-            errors = np.stack([bend(along / travel) for bend in bends], axis=1)
-            errors[:, 0] += 1e-3 * self.periodic_um * np.sin(2 * np.pi * along / self.pitch_mm + phase)
-            return displace_poses(poses, np.hstack([errors[:, :3] @ guide.T, errors[:, 3:] @ guide.T]))
-
-        return PlatformMotion(true, commanded)
+# --- rotary table -----------------------------------------------------------------------------------------------------
 
 
 class RotaryTable(Platform):
@@ -297,30 +241,6 @@ class RotaryTable(Platform):
             return true_axis @ (turned(by) @ np.linalg.inv(table))
 
         return PlatformMotion(true, lambda times: nominal @ turned(angle(times)))
-
-
-def _axes(along: np.ndarray) -> np.ndarray:
-    """Return axes (3, 3), in columns, with x along a direction and z as close to the scene's Z as possible."""
-    up = np.array([0.0, 0.0, 1.0]) if abs(along[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
-    across = np.cross(up, along)
-    across /= np.linalg.norm(across)
-    return np.column_stack([along, across, np.cross(along, across)])
-
-
-def _draw_bend(size: float, rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
-    """Return an error motion over the travelled fraction, 0 to 1, with a given range.
-
-    It consists of waves of 1 to 4 periods with amplitudes that decrease as 1/n.
-    """
-    orders = np.arange(1, 5)
-    weights, phases = rng.standard_normal(4) / orders, rng.uniform(0, 2 * np.pi, 4)
-
-    def raw(share: np.ndarray) -> np.ndarray:
-        return np.sin(2 * np.pi * np.multiply.outer(share, orders) + phases) @ weights
-
-    over = raw(np.linspace(0, 1, 201))
-    scale = size / float(np.ptp(over))
-    return lambda share: scale * (raw(share) - over[0])
 
 
 # --- robot arm --------------------------------------------------------------------------------------------------------

@@ -319,7 +319,7 @@ class Route(Platform):
     def command_poses(self) -> Poses:
         """Return the nominal poses ``T_scene_platform`` of the path."""
         times, poses = self._knots
-        return _path(times, poses @ np.linalg.inv(self.mount.matrix()), stops=not self.moves())
+        return _interpolate_path(times, poses @ np.linalg.inv(self.mount.matrix()), stops=not self.moves())
 
 
 class IdealPath(Route):
@@ -357,7 +357,7 @@ def _course(platform: Platform) -> Course:
 # --- geometry -------------------------------------------------------------------------------------------------------
 
 
-def _path(times: np.ndarray, poses: np.ndarray, *, stops: bool) -> Poses:
+def _interpolate_path(times: np.ndarray, poses: np.ndarray, *, stops: bool) -> Poses:
     """Interpolate poses (K, 4, 4) at times (K,): stepwise at stops, else by splines with linear extrapolation."""
     if stops or len(times) == 1:
         return lambda wanted: poses[find_stop(times, wanted)]

@@ -174,8 +174,8 @@ def _add_normal_numbers(
 def _layers() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return outer edges divided by `_MANTISSA` (L,), floor heights (L + 1,) and inner parts (L,) of the layers.
 
-    Layers are numbered from below. The lowest one contains the tail; its width is that of a rectangle with its area. Of
-    the positions up to `_MANTISSA`, those below the inner part are under the density at all heights of the layer.
+    Layers are numbered from below. The lowest one contains the tail; its width is that of a rectangle with its area. A
+    position, from 0 to `_MANTISSA`, that is below the inner part is under the density at every height of the layer.
     """
     edges = [_LAYER_AREA / math.exp(-0.5 * _LAST_EDGE**2), _LAST_EDGE]
     while len(edges) < _LAYERS:

@@ -159,8 +159,7 @@ def _is_dead_reckoned(trajectory: Trajectory) -> bool:
     velocity = trajectory.rates_at(trajectory.times_s)
     aside = heading[:, None] * np.column_stack([-velocity[:, 1], velocity[:, 0]])
     expected = heading[:, None] * cumulative_trapezoid(aside, trajectory.times_s, axis=0, initial=0.0)
-    stated = trajectory.covariance[:, :2, 5]
-    return bool(np.sum(stated * expected) > _AS_DEAD_RECKONED * np.sum(expected**2))
+    return bool(np.sum(trajectory.covariance[:, :2, 5] * expected) > _AS_DEAD_RECKONED * np.sum(expected**2))
 
 
 _EXACT = 1e-10  # variance at the start of the path, relative to that at its end; the start defines the frame
@@ -216,8 +215,7 @@ class PathPrior:
     def weights(self, times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the index (N,) of the node before each time (N,), and the weight (N,) of the next node."""
         before = np.clip(np.searchsorted(self.nodes_s, times_s, side="right") - 1, 0, self.count - 2)
-        after = (times_s - self.nodes_s[before]) / np.diff(self.nodes_s)[before]
-        return before, np.clip(after, 0.0, 1.0)
+        return before, np.clip((times_s - self.nodes_s[before]) / np.diff(self.nodes_s)[before], 0.0, 1.0)
 
     def basis(self, times_s: np.ndarray) -> np.ndarray:
         """Return the weights (N, C) of all nodes at times (N,)."""

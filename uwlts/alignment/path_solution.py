@@ -104,7 +104,7 @@ class PathEstimate:
 
     def relative_movement(self, pair: Pair, at_mm: np.ndarray) -> np.ndarray:
         """Return the derivatives (6, 6 C) of the later piece's motion relative to the earlier one at a place (3,)."""
-        basis = self.prior.basis(self._middles_s[list(pair)])
+        basis = self.prior.basis(self._middle_times_s[list(pair)])
         return np.einsum("ipj,pc->ijc", self._relative_twists(pair, at_mm), basis).reshape(6, -1)
 
     def relative_covariance(self, pair: Pair, at_mm: np.ndarray) -> np.ndarray:
@@ -124,14 +124,14 @@ class PathEstimate:
         return result
 
     @cached_property
-    def _middles_s(self) -> np.ndarray:
+    def _middle_times_s(self) -> np.ndarray:
         """Times (N,) of the middle patches of all pieces, s."""
         return np.array([piece.times_s[piece.middle_patch] for piece in self.pieces])
 
     @cached_property
     def _middle_covariance(self) -> np.ndarray:
         """Covariance (N, 6, N, 6) of the corrections in the middle of all N pieces."""
-        basis = self.prior.basis(self._middles_s)
+        basis = self.prior.basis(self._middle_times_s)
         by = self.prior.times_transposed_root(np.einsum("ij,pc->icpj", np.eye(6), basis).reshape(len(self.values), -1))
         half = solve_triangular(self.factor, by, lower=True, check_finite=False)
         return (half.T @ half).reshape(len(basis), 6, len(basis), 6)

@@ -194,8 +194,7 @@ def fit_piece(
     # Errors common to all points do not affect differences between passes.
     known = None if known is None else replace(known, patterns_mm=known.patterns_mm[:0], poses_mm=None)
     try:
-        points = survey.points_along(part, corrections)
-        patches = surface_patches(points, known, radius_mm=survey.radius_mm)
+        patches = surface_patches(survey.points_along(part, corrections), known, radius_mm=survey.radius_mm)
     except EvaluationError:
         return None
     image = survey.image[part[patches.numbers]]

@@ -65,8 +65,7 @@ def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointRe
     earlier = options.earlier
     if earlier is not None:
         gathered = join_media(gathered, earlier, new=not options.same_water)
-        camera = read_earlier(earlier, gathered).parameters.intrinsics.options
-        options = replace(options, camera=camera, lens=None)
+        options = replace(options, camera=read_earlier(earlier, gathered).parameters.intrinsics.options, lens=None)
     options, off_px = hold_camera(gathered, options), dict[str, list[float]]()
     try:
         problem, result, against, changes = solve_consistently(gathered, options)

@@ -119,7 +119,7 @@ def find_air_evidence(
             done = _report(progress, "target", done, total)
         positions = np.array([image.stage_mm for image in images[first:]])
         on_target = partial(_find_target_stripe, capture, stripe, first, views[first:], positions, targets[0])
-        for (frame, _), found in map_in_threads(on_target, _laser_frames(capture)):
+        for (frame, _), found in map_in_threads(on_target, _read_laser_frames(capture)):
             if isinstance(found, str):
                 warnings.append(f"{capture.path.name}, frame {frame}: stripe left out, {found}")
             else:
@@ -206,7 +206,7 @@ def step_evidence(
         if index is None:
             index = capture.header.medium.refractive_index(wavelength)
             index_std = capture.header.medium.index_uncertainty(wavelength, known)
-        for (frame, _), pixels in map_in_threads(partial(_find_stripe, capture, stripe), _laser_frames(capture)):
+        for (frame, _), pixels in map_in_threads(partial(_find_stripe, capture, stripe), _read_laser_frames(capture)):
             if isinstance(pixels, str):
                 warnings.append(f"{capture.path.name}, frame {frame}: stripe left out, {pixels}")
             else:
@@ -264,7 +264,7 @@ def _laser_images(capture: Capture, most: int) -> Iterator[np.ndarray]:
 _Seen = tuple[int, np.ndarray | Stripe]  # number of a laser frame, and its image or the stripe from a 3D camera
 
 
-def _laser_frames(capture: Capture) -> Iterator[_Seen]:
+def _read_laser_frames(capture: Capture) -> Iterator[_Seen]:
     for frame in np.flatnonzero(capture.laser_on).tolist():
         yield frame, capture.read_observation(frame)
 

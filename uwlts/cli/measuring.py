@@ -44,21 +44,21 @@ def reconstruct(
     from uwlts.recalibration.pass_check import check_passes
     from uwlts.storage.capture import Capture
     from uwlts.storage.cloud import VERIFIED
+    from uwlts.storage.cloud_files import write_cloud_in_parts
 
-    with Capture(call.given["capture"]) as capture:
-        cloud = call(capture=capture)
-        lit = int(capture.laser_on.sum())
-    cloud.save(out, overwrite=overwrite)
+    with Capture(call.given["capture"]) as capture, write_cloud_in_parts(out, overwrite=overwrite) as write:
+        seen, lit = set[int](), int(capture.laser_on.sum())
+        cloud = call(capture=capture, take=lambda part: (seen.update(part.frame.tolist()), write(part)))
     warn(*cloud.warnings)
     if check := check_passes(cloud):
         (say if check.agree else warn)(check.text)
     if until := cloud.metadata.get(VERIFIED):
         say(f"calibration verified until {until}")
-    say(f"laser images with a point: {len(set(cloud.frame.tolist()))} of {lit}")
+    say(f"laser images with a point: {len(seen)} of {lit}")
     say(f"profile lines: {_counts(cloud.lines_by_status)}")
     if lost := _counts({name: count for name, count in cloud.rays_by_status.items() if name != "ok"}):
         say(f"stripe centres without a point: {lost}")
-    say(cloud_written(out, len(cloud)))
+    say(cloud_written(out, cloud.rays_by_status["ok"]))
     note_lean(out, cloud)
 
 
@@ -286,6 +286,5 @@ def thesis(
 @command_from(app, uwlts.report, "write_domain_gap", job="Inspect", shortcuts=STRIPE)
 def domain_gap(call: Call) -> None:
     """Example: uwlts domain-gap runs/clean runs/turbid --real photographs bust/laser.png --out gap.html"""
-    found = call()
-    show(found.lines())
+    show(call().lines())
     wrote_page(Path(call.given["out"]))

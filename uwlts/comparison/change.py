@@ -433,8 +433,7 @@ def _thin_points(points: np.ndarray, spacing: float) -> tuple[np.ndarray, float]
     The side grows if there would be too many places.
     """
     while True:
-        cubes = number_cubes(points - points.min(axis=0), spacing)
-        first = np.sort(np.unique(cubes, return_index=True)[1])
+        first = np.sort(np.unique(number_cubes(points - points.min(axis=0), spacing), return_index=True)[1])
         if len(first) <= OPTIONS.most_places:
             return first, spacing
         # The number of cubes on a surface is inversely proportional to the square of their side.

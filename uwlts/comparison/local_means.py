@@ -119,8 +119,7 @@ def _student_ratio(number: np.ndarray) -> np.ndarray:
 def _pair_blocks(tree: KDTree, places: np.ndarray, radius: float) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
     """Yield blocks of places, with the numbers of places within the block and of points of nearby pairs."""
     counts = tree.query_ball_point(places, radius, return_length=True, workers=-1)
-    part = np.cumsum(counts) // _PAIRS_AT_A_TIME
-    starts = np.flatnonzero(np.diff(part, prepend=-1)).tolist()
+    starts = np.flatnonzero(np.diff(np.cumsum(counts) // _PAIRS_AT_A_TIME, prepend=-1)).tolist()
     for start, end in pairwise([*starts, len(places)]):
         found = tree.query_ball_point(places[start:end], radius, workers=-1)
         lengths = counts[start:end]
@@ -145,8 +144,7 @@ def _propagate_variance(
     group, owner = _place_images(place, image)
     result = np.zeros(size)
     for part in known.image_errors_mm():
-        moved = np.einsum("ni,ni->n", part[point], normal)
-        together = np.bincount(owner, moved / many[place])
+        together = np.bincount(owner, np.einsum("ni,ni->n", part[point], normal) / many[place])
         result += np.bincount(group, together**2, minlength=size)
     moves = np.zeros((size, len(known.patterns_mm)))
     for number_of, pattern in enumerate(known.patterns_mm):

@@ -18,6 +18,7 @@ from scipy.spatial import KDTree
 
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.figures import TOWARDS_SENSOR
+from uwlts.fitting.least_squares import robust_std
 from uwlts.fitting.local_surface import LocalSurface, SurfacePoints, choose_disc_diameter, group_rows, surface_normals
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.cloud import PointCloud, project_image_errors, project_variance
@@ -33,6 +34,9 @@ _CUBES_OF_WALL = 1.5
 """Cubes per thickness of the thinnest wall. Without noise, walls up to 48 deg from the cube edges hold a corner."""
 _WALLS_ASKED = 4000  # number of points at which the wall thickness is measured
 _OPPOSITE = 0.7  # cosine of the largest angle (45 deg) between the normals of two opposite sides, one of them reversed
+_RESOLVED = 3.0
+"""Least thickness of a wall, in standard deviations of the height between neighbours on one side: four times the noise
+of a point, at which few points lie beyond the middle of the wall."""
 _FARTHEST_CUBES = 0.75  # largest distance of a vertex from its patch, in cubes; a larger one mixes two walls
 _FEWEST_OF_PIECE = 20  # least number of triangles of a connected piece; smaller ones are outliers
 
@@ -191,9 +195,10 @@ def _thinnest_wall(points: SurfacePoints, radius: float) -> float:
     neighbours = cast(list[list[int]], tree.query_ball_point(places[chosen], radius))
     found = [near[:: max(1, len(near) // 200)] for near in neighbours]
     owner, other = np.repeat(chosen, [len(each) for each in found]), np.concatenate(found)
-    opposite = np.einsum("ni,ni->n", points.normals[owner], points.normals[other]) < -_OPPOSITE
+    facing = np.einsum("ni,ni->n", points.normals[owner], points.normals[other])
     below = -np.einsum("ni,ni->n", places[other] - places[owner], points.normals[owner])
-    behind = opposite & (below > 0)
+    # Normals of noisy points are opposite by chance.
+    behind = (facing < -_OPPOSITE) & (below > _RESOLVED * robust_std(below[facing > _OPPOSITE]))
     thickness = np.full(len(places), np.inf)
     np.minimum.at(thickness, owner[behind], below[behind])
     return float(np.quantile(thickness[chosen], 0.02, method="lower")) if len(chosen) else np.inf
@@ -204,8 +209,7 @@ def _corners_near(cells: np.ndarray) -> np.ndarray:
     shape = cells.max(axis=0) + 8
     keys = _sort_unique(np.asarray(np.ravel_multi_index(tuple(cells.T + 3), tuple(shape))))
     for axis in range(3):
-        step = int(np.prod(shape[axis + 1 :]))
-        keys = _sort_unique((keys + step * np.arange(-2, 4)[:, None]).ravel())
+        keys = _sort_unique((keys + int(np.prod(shape[axis + 1 :])) * np.arange(-2, 4)[:, None]).ravel())
     corners = np.empty((len(keys), 3), np.int32)
     for axis, place in enumerate(np.unravel_index(keys, tuple(shape))):
         corners[:, axis] = place - 3
@@ -289,8 +293,7 @@ def _weld_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
     pairs = shared[KDTree(vertices[shared]).query_pairs(1e-3, output_type="ndarray")]
     links = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(vertices),) * 2)
     owner = connected_components(links, directed=False)[1]
-    first = np.unique(owner, return_index=True)[1]
-    return vertices[first], owner[faces]
+    return vertices[np.unique(owner, return_index=True)[1]], owner[faces]
 
 
 def _orient_faces(places: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> np.ndarray:

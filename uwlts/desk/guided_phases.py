@@ -277,7 +277,10 @@ class TargetPhase:
         since_s, skipped = time.monotonic(), 0
         while list_missing(state) and len(state.recorded) < self._plan.most_images:
             found = self.find(self._session.take("lamp")[0])
-            advice = advice or best_pose(state, spin_rad=_estimate_spin(found.usable, state), skipped=skipped)
+            if not advice:
+                latest = state.poses[-1:] if found.usable is None else [estimate_pose(found.usable, state.camera)]
+                spin_rad = float(np.arctan2(latest[0][1, 0], latest[0][0, 0])) if len(latest) else 0.0
+                advice = best_pose(state, spin_rad=spin_rad, skipped=skipped)
             answer = self._session.screen.answer()
             if answer == "done":
                 break
@@ -354,12 +357,6 @@ class TargetPhase:
 
     def _show_state(self, state: State) -> None:
         self._session.screen.show_coverage(state.coverage, [pose.view.pixels for pose in state.recorded])
-
-
-def _estimate_spin(view: TargetView | None, state: State) -> float:
-    """Return the latest orientation of the target in the image, in rad."""
-    poses = [estimate_pose(view, state.camera)] if view is not None else state.poses[-1:]
-    return float(np.arctan2(poses[0][1, 0], poses[0][0, 0])) if len(poses) else 0.0
 
 
 @dataclass(frozen=True)

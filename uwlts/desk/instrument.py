@@ -399,8 +399,7 @@ class Instrument:
         stage = self._stage()
         self._stop.clear()
         self._paused.clear()
-        header = plan.header(out.stem)
-        view = RecordingView(board, header, known, name=out.name)
+        view = RecordingView(board, plan.header(out.stem), known, name=out.name)
         begun: list[int] = []
         if resume and part_path(out).is_file():
             with Capture(part_path(out)) as earlier:

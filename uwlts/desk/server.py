@@ -54,21 +54,10 @@ class DeskServer:
     controls. ``warning`` is a warning to report if other machines can reach the page, else None. ``app`` is the
     application, for further routes.
 
-    Parameters
-    ----------
-    board : Board
-        Content of the page.
-    build : callable, optional
-        Function of the board and of whether the page is for the operator, which builds the page.
-    host, port
-        Address to serve at.
-    switch : LaserSwitch, optional
-        Switch with a button on the operator's page; its process listens at the next free port after the page's.
+    ``build``, a function of the board and of whether the page is for the operator, builds the page at ``host`` and
+    ``port``. ``switch`` is a switch with a button on the operator's page; its process listens at the next free port.
 
-    Raises
-    ------
-    SetupError
-        No port is free, the address is not one of this machine, or this process already serves a page.
+    SetupError if no port is free, the address is not one of this machine, or this process already serves a page.
     """
 
     def __init__(
@@ -131,20 +120,24 @@ class DeskServer:
                 log_level=logging.ERROR,
                 ws_max_size=2**20,
             )
-            self._server = uvicorn.Server(config)
-            self._thread = threading.Thread(target=self._server.run, args=([self._socket],), name="page", daemon=True)
-            self._thread.start()
-            deadline = time.monotonic() + _START_S
-            while not self._server.started:
-                if time.monotonic() > deadline or not self._thread.is_alive():
-                    why = errors[0].strip().rpartition("\n")[2] if errors else "no reason is known"
-                    raise SetupError(f"the page's server did not start: {why}")
-                time.sleep(0.02)
+            self._start(uvicorn.Server(config), errors)
         except BaseException:
             if switch is not None:
                 switch.close()
             _ALONE.release()
             raise
+
+    def _start(self, server: uvicorn.Server, errors: list[str]) -> None:
+        """Run a server in a thread of its own, and wait until it answers; SetupError with the first of its errors."""
+        self._server = server
+        self._thread = threading.Thread(target=server.run, args=([self._socket],), name="page", daemon=True)
+        self._thread.start()
+        deadline = time.monotonic() + _START_S
+        while not server.started:
+            if time.monotonic() > deadline or not self._thread.is_alive():
+                why = errors[0].strip().rpartition("\n")[2] if errors else "no reason is known"
+                raise SetupError(f"the page's server did not start: {why}")
+            time.sleep(0.02)
 
     def _add_content(self, board: Board) -> None:
         """Add the routes for picture, coverage and cloud."""

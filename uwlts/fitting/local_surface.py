@@ -162,95 +162,121 @@ def _fit_patches(places, grid, columns, systematic, results):
     scans, and the number of scans. ``results`` are heights (P,), normals (P, 3), whether a patch is found (P,), and
     variances (P, 2) by noise and by systematic errors.
     """
-    points, radius = grid.points_mm, grid.cell_mm
-    normals, weight, noise, position, image = columns
-    patterns, scan, scans = systematic
+    radius, normals = grid.cell_mm, columns[0]
+    patterns, _, scans = systematic
     height, fitted_normals, found, variance = results
-    by = np.empty(_TERMS + 1)
+    by, frame = np.empty(_TERMS + 1), np.empty((3, 3))
+    matrix, right = np.empty((_TERMS, _TERMS)), np.empty(_TERMS)
+    images, moves = np.empty(_MOST_IMAGES, np.int64), np.empty(_MOST_IMAGES)
     for number in range(len(places)):
         place = places[number]
-        nearest, least = -1, radius * radius
-        for row in range(9):
-            start, end = _find_row(grid, place, row)
-            for k in range(start, end):
-                dist = (points[k, 0] - place[0]) ** 2 + (points[k, 1] - place[1]) ** 2 + (points[k, 2] - place[2]) ** 2
-                if dist < least:
-                    nearest, least = k, dist
+        nearest = _find_nearest(grid, place)
         if nearest < 0:
             continue
-        normal = normals[nearest]
-        # Two tangents.
-        first = (
-            np.array((0.0, -normal[2], normal[1])) if abs(normal[0]) < 0.7 else np.array((-normal[1], normal[0], 0.0))
-        )
+        x, y, z = normals[nearest]
+        # Two tangents, and the normal.
+        first = np.array((0.0, -z, y)) if abs(x) < 0.7 else np.array((-y, x, 0.0))
         first /= np.sqrt(np.sum(first * first))
-        second = np.cross(normal, first)
-        matrix, right = np.zeros((_TERMS, _TERMS)), np.zeros(_TERMS)
-        count, total, left_u, left_v = 0, 0.0, 0.0, 0.0
-        for row in range(9):
-            start, end = _find_row(grid, place, row)
-            for k in range(start, end):
-                kernel = _fill_terms(points[k], place, normal, first, second, normals[k], radius, by)
-                if kernel > 0:
-                    share = kernel * weight[k]
-                    count += 1
-                    total += share
-                    left_u += share * by[1] * radius
-                    left_v += share * by[2] * radius
-                    for i in range(_TERMS):
-                        right[i] += share * by[i] * by[_TERMS]
-                        for j in range(_TERMS):
-                            matrix[i, j] += share * by[i] * by[j]
+        frame[0], frame[1], frame[2] = first, np.cross(normals[nearest], first), normals[nearest]
+        count, total, beside = _fill_equations(place, grid, columns, frame, by, matrix, right)
         if count < _FEWEST:
             continue
         for i in range(_TERMS):
             # A small ridge suppresses the curvature that points on few lines leave undetermined.
             matrix[i, i] += 1e-6 * total
         inverse = np.linalg.inv(matrix)
-        answer = inverse[0]
         coefficients = inverse @ right
-        square, scatter, freedom = 0.0, 0.0, 0.0
-        single, images, moves, many = 0.0, np.empty(_MOST_IMAGES, np.int64), np.zeros(_MOST_IMAGES), 0
         shared = np.zeros((scans, patterns.shape[1]))
-        for row in range(9):
-            start, end = _find_row(grid, place, row)
-            for k in range(start, end):
-                kernel = _fill_terms(points[k], place, normal, first, second, normals[k], radius, by)
-                if kernel <= 0:
-                    continue
-                share = kernel * weight[k]
-                part = share * np.sum(answer * by[:_TERMS])
-                square += part * part
-                residual = by[_TERMS] - np.sum(coefficients * by[:_TERMS])
-                scatter += share * residual * residual
-                freedom += share
-                single += part * part * noise[k]
-                at = 0
-                while at < many and images[at] != image[k]:
-                    at += 1
-                if at == many and many < _MOST_IMAGES:
-                    images[at] = image[k]
-                    many += 1
-                at = min(at, _MOST_IMAGES - 1)
-                moves[at] += part * position[k]
-                for m in range(patterns.shape[1]):
-                    shared[scan[k], m] += part * patterns[k, m]
+        moves[:] = 0.0
+        square, scatter, by_points = _sum_errors(
+            place, grid, columns, systematic, frame, by, (inverse[0], coefficients), (images, moves, shared)
+        )
         # Reject heights that are less certain than one point, and places at the border of their points.
-        beside = np.sqrt(left_u * left_u + left_v * left_v) / total
         if square >= 1.0 or beside > 0.4 * radius:
             continue
         found[number] = True
         height[number] = coefficients[0]
-        slope = normal - (coefficients[1] * first + coefficients[2] * second) / radius
+        slope = frame[2] - (coefficients[1] * frame[0] + coefficients[2] * frame[1]) / radius
         fitted_normals[number] = slope / np.sqrt(np.sum(slope * slope))
-        rough = scatter / freedom * count / max(count - _TERMS, 1) * square
-        variance[number, 0] = max(single, rough) + np.sum(moves[:many] ** 2)
+        rough = scatter * count / max(count - _TERMS, 1) * square
+        variance[number, 0] = max(by_points, rough) + np.sum(moves * moves)
         variance[number, 1] = np.sum(shared * shared)
 
 
 @compiled
-def _fill_terms(point, place, normal, first, second, normal_there, radius, by):
+def _find_nearest(grid, place):
+    """Return the number of the point nearest to a place within the cell size, or -1."""
+    points, nearest, least = grid.points_mm, -1, grid.cell_mm * grid.cell_mm
+    for row in range(9):
+        start, end = _find_row(grid, place, row)
+        for k in range(start, end):
+            dist = (points[k, 0] - place[0]) ** 2 + (points[k, 1] - place[1]) ** 2 + (points[k, 2] - place[2]) ** 2
+            if dist < least:
+                nearest, least = k, dist
+    return nearest
+
+
+@compiled
+def _fill_equations(place, grid, columns, frame, by, matrix, right):
+    """Fill the normal equations of a patch; return number and weight of its points, and the distance of their mean."""
+    normals, weight = columns[0], columns[1]
+    matrix[:], right[:] = 0.0, 0.0
+    count, total, left_u, left_v = 0, 0.0, 0.0, 0.0
+    for row in range(9):
+        start, end = _find_row(grid, place, row)
+        for k in range(start, end):
+            kernel = _fill_terms(grid.points_mm[k], place, frame, normals[k], grid.cell_mm, by)
+            if kernel <= 0:
+                continue
+            share = kernel * weight[k]
+            count, total = count + 1, total + share
+            left_u, left_v = left_u + share * by[1], left_v + share * by[2]
+            for i in range(_TERMS):
+                right[i] += share * by[i] * by[_TERMS]
+                for j in range(_TERMS):
+                    matrix[i, j] += share * by[i] * by[j]
+    return count, total, grid.cell_mm * np.sqrt(left_u * left_u + left_v * left_v) / max(total, 1e-300)
+
+
+@compiled
+def _sum_errors(place, grid, columns, systematic, frame, by, fitted, sums):
+    """Return the sum of squared parts of the points in a patch's height, their scatter, and the variance by noise.
+
+    ``fitted`` are the row of the inverse for the height and the coefficients. ``sums`` are images, and the changes of
+    the height to fill: by the position of each of these, and by patterns of each scan.
+    """
+    normals, weight, noise, position, image = columns
+    patterns, scan, _ = systematic
+    (answer, coefficients), (images, moves, shared) = fitted, sums
+    square, scatter, freedom, by_points, many = 0.0, 0.0, 0.0, 0.0, 0
+    for row in range(9):
+        start, end = _find_row(grid, place, row)
+        for k in range(start, end):
+            kernel = _fill_terms(grid.points_mm[k], place, frame, normals[k], grid.cell_mm, by)
+            if kernel <= 0:
+                continue
+            share, height, residual = kernel * weight[k], 0.0, by[_TERMS]
+            for i in range(_TERMS):
+                height += answer[i] * by[i]
+                residual -= coefficients[i] * by[i]
+            part = share * height
+            square, by_points = square + part * part, by_points + part * part * noise[k]
+            scatter, freedom = scatter + share * residual * residual, freedom + share
+            at = 0
+            while at < many and images[at] != image[k]:
+                at += 1
+            if at == many and many < _MOST_IMAGES:
+                images[at], many = image[k], many + 1
+            moves[min(at, _MOST_IMAGES - 1)] += part * position[k]
+            for m in range(patterns.shape[1]):
+                shared[scan[k], m] += part * patterns[k, m]
+    return square, scatter / freedom, by_points
+
+
+@compiled
+def _fill_terms(point, place, frame, normal_there, radius, by):
     """Fill 1, u, v, u^2, u v, v^2 of a point (unit: radius) and its height (7,); return its kernel weight."""
+    first, second, normal = frame[0], frame[1], frame[2]
     if normal_there[0] * normal[0] + normal_there[1] * normal[1] + normal_there[2] * normal[2] < _SAME_SIDE:
         return 0.0
     a, b, c = point[0] - place[0], point[1] - place[1], point[2] - place[2]

@@ -114,17 +114,9 @@ def rank_candidates(
 
     For several observations in turn, rank the remaining candidates again from the best forecast's ``known``.
 
-    Parameters
-    ----------
-    known
-        Covariance of the P parameters before.
-    functions
-        Derivatives (M, P) of the functions of interest by the parameters, for example of lengths.
-    candidates
-        Possible observations. Those with the same effect stay in their order.
-    figure
-        Figure to be reduced, as a function of the standard uncertainties (M,) and the candidate (None: before it); by
-        default the root mean square of the uncertainties.
+    ``known`` is the covariance of the P parameters before; ``functions`` (M, P) are derivatives of the functions of
+    interest, for example of lengths. ``figure`` is to be reduced, a function of the standard uncertainties (M,) and the
+    candidate (None: before it), by default their root mean square. Candidates with equal effect stay in their order.
     """
     measure = figure or (lambda std, _: float(np.sqrt(np.mean(std**2))))
     before, found = measure(known.std(functions), None), []

@@ -232,11 +232,9 @@ def _fit_discs(discs: _Discs, axes: np.ndarray, radius: float) -> _DiscFit:
     inverse = np.linalg.inv(normal + ridge)
     shape = (inverse @ (weighted.transpose(0, 2, 1) @ w[:, :, None]))[:, :, 0]
     left = np.where(discs.held, w - (columns @ shape[:, :, None])[:, :, 0], 0.0)
-    freedom = np.maximum(discs.held.sum(axis=1) - 6, 1)
     # Variance of one point: the variance of an average of n points is 1/n of it.
-    variance = np.sum(weight * left**2, axis=1) / freedom
-    heights = (weighted @ inverse[:, 0, :, None])[:, :, 0]
-    return _DiscFit(shape, inverse, variance, heights.astype(np.float32))
+    variance = np.sum(weight * left**2, axis=1) / np.maximum(discs.held.sum(axis=1) - 6, 1)
+    return _DiscFit(shape, inverse, variance, (weighted @ inverse[:, 0, :, None])[:, :, 0].astype(np.float32))
 
 
 def find_disc_radius(points_mm: np.ndarray) -> float:
@@ -251,8 +249,7 @@ def find_disc_radius(points_mm: np.ndarray) -> float:
         raise EvaluationError("most points have six others at the same place: omit repeated points")
     while radius < _LARGEST_PATCH * size:
         averages, *_ = _average_in_cubes(points_mm, radius / _CELLS_PER_RADIUS)
-        step = max(1, len(averages.counts) // _SAMPLE)
-        discs = _gather_discs(averages, averages.places_mm[::step], radius)
+        discs = _gather_discs(averages, averages.places_mm[:: max(1, len(averages.counts) // _SAMPLE)], radius)
         spread = np.linalg.eigvalsh(np.einsum("pk,pki,pkj->pij", 1.0 * discs.held, discs.about_mm, discs.about_mm))
         enough = discs.held.sum(axis=1) >= 2 * _FEWEST
         round_ = spread[:, 1] > _ROUND * spread[:, 2]
@@ -431,10 +428,8 @@ def _select_central(points: np.ndarray, spacing: float) -> np.ndarray:
     """Select the point nearest to the centre of each non-empty cube of side ``spacing``."""
     place = (points - points.min(axis=0)) / spacing
     cells = np.floor(place).astype(np.int64)
-    off = np.sum((place - cells - 0.5) ** 2, axis=1)
-    order = np.lexsort((off, *cells.T))
-    changed = np.any(np.diff(cells[order], axis=0), axis=1)
-    return np.sort(order[np.r_[True, changed]])
+    order = np.lexsort((np.sum((place - cells - 0.5) ** 2, axis=1), *cells.T))
+    return np.sort(order[np.r_[True, np.any(np.diff(cells[order], axis=0), axis=1)]])
 
 
 def _principal_frames(about: np.ndarray, weight: np.ndarray) -> np.ndarray:

@@ -92,29 +92,16 @@ def schur_least_squares(
 ) -> SchurFit:
     """Minimise the squares over all groups, eliminating the local parameters in each step (Schur complement).
 
-    Parameters
-    ----------
-    model : callable
-        Function of the group number, global values and local values. It returns an `Observation`, several that form
-        one, or None if the parameters are infeasible.
-    global_values : (k,)
-        Initial global parameters.
-    local : sequence of (b,)
-        Initial local parameters of the groups.
-    soft_limit : float, optional
-        Scale s of the "soft L1" loss 2 s^2 (sqrt(1 + |r|^2 / s^2) - 1) of residual vectors r; quadratic by default.
-    smallest_gain : float
-        Relative reduction of the cost, measured or predicted, that ends the iteration.
-    damping : float
-        Initial damping relative to the squared lengths of the derivatives; near the solution none is needed.
-    enough_rounds : int, optional
-        Number of rounds after which the iteration ends in any case.
+    ``model`` is a function of the group number, global values (K,) and local values (B,). It returns an `Observation`,
+    several that form one, or None if the parameters are infeasible. ``global_values`` and ``local`` are initial values.
 
-    Raises
-    ------
-    CalibrationError
-        The initial parameters are infeasible, the observations do not determine the parameters, or the iteration does
-        not converge within 60 rounds.
+    ``soft_limit`` is the scale s of the "soft L1" loss 2 s^2 (sqrt(1 + |r|^2 / s^2) - 1) of residual vectors r, by
+    default quadratic. The iteration ends when the cost is reduced, or predicted to be, by less than the fraction
+    ``smallest_gain``, or after ``enough_rounds``. The initial ``damping`` is relative to the squared lengths of the
+    derivatives; near the solution none is needed.
+
+    CalibrationError if the initial parameters are infeasible, the observations do not determine the parameters, or the
+    iteration does not converge within 60 rounds.
     """
     global_values, local = np.array(global_values, dtype=np.float64), [np.array(o, dtype=np.float64) for o in local]
     normal = _assemble(model, global_values, local, soft_limit)

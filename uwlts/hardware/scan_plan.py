@@ -191,8 +191,7 @@ class ScanPlan(RigPlan):
 
     def make_record(self) -> Table:
         """Return the part of the plan that determines the images, as JSON, without addresses and motion settings."""
-        omitted = {"title", "sensor", "camera", "check_steps"}
-        table = self.model_dump(mode="json", exclude=omitted)
+        table = self.model_dump(mode="json", exclude={"title", "sensor", "camera", "check_steps"})
         for key in ("port", "feed_mm_per_min", "settle_s"):
             del table["stage"][key]
         return table

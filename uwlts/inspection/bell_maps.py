@@ -266,8 +266,7 @@ def fit_bells(surface: UnrolledSurface, undamaged: np.ndarray, radius: float) ->
     seen = filled & (information > 1e-9)
     usual = float(np.median(information[seen])) if seen.any() else np.inf
     seen &= information > SEARCH_RULE.least_information * usual
-    root = np.sqrt(np.where(seen, information, 1.0))
-    scaled = np.where(seen, amplitude / root, np.nan)
+    scaled = np.where(seen, amplitude / np.sqrt(np.where(seen, information, 1.0)), np.nan)
     spread, z = _standardise(scaled, max(1, round(SEARCH_RULE.scatter_block * SEARCH_RULE.cells_per_radius)))
     height = np.where(seen, amplitude / np.where(seen, information, 1.0), np.nan)
     moments = np.array([_spectral_moment(z, axis, cell) for axis in (0, 1)])

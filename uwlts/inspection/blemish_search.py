@@ -113,7 +113,8 @@ def search_blemishes(surface: UnrolledSurface, *, false_alarm: float, largest_mm
         maps = [each for each in maps if each.area_mm2 > 0]
         if not maps:
             break
-        threshold = _solve_threshold(maps, false_alarm)
+        # Noise exceeds it with the given probability; the sum over sizes is an upper bound.
+        threshold: Any = optimize.brentq(lambda z, maps=maps: sum(m.false_alarms(z) for m in maps) - false_alarm, 1, 40)
         peaks = _choose_peaks(maps, threshold)
         if not peaks:
             break
@@ -211,12 +212,6 @@ def _assign_outliers(
             reason = f"{len(points)} points show it; {SEARCH_RULE.points_in_smallest} are needed"
             departures.append(UnresolvedDeparture(top, float(heights[top]), float(loose.min()), reason))
     return departures
-
-
-def _solve_threshold(maps: Sequence[BellMap], false_alarm: float) -> float:
-    """Return the level that noise exceeds with the given probability. The sum over sizes is an upper bound."""
-    level: Any = optimize.brentq(lambda z: sum(m.false_alarms(z) for m in maps) - false_alarm, 1.0, 40.0)
-    return float(level)
 
 
 @dataclass(frozen=True, eq=False)

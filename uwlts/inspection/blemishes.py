@@ -272,8 +272,7 @@ class _Bell:
         if seen[0] <= 0:
             raise NotSignificantError("it does not depart from its surroundings in this direction")
         rim = float(np.sqrt(1 - min(edge / seen[0], 0.99) ** (1 / exponent)))
-        half = np.where(seen[1:3] > 0, 0.5 * seen[1:3] / rim, radius)
-        return cls(middle, half, float(seen[0]), exponent)
+        return cls(middle, np.where(seen[1:3] > 0, 0.5 * seen[1:3] / rim, radius), float(seen[0]), exponent)
 
     def depths_at(self, places: np.ndarray) -> np.ndarray:
         """Return depths (N,) at places (N, 2)."""

@@ -147,30 +147,38 @@ def inspect_flange(
         except EvaluationError as error:
             if len(np.unique(edges.frame)) >= _Rule.fewest_images:
                 notes.append(_note_omission(face, edges.places.mean(axis=0), str(error)))
-    if holes:
-        largest = max(holes, key=lambda hole: hole.radius_mm)
-        bolts = [hole for hole in holes if hole is not largest]
-        usual = float(np.median([hole.radius_mm for hole in bolts])) if bolts else 0.0
-        for hole in bolts.copy():
-            if abs(hole.radius_mm - usual) >= _Rule.same_diameter * usual:
-                bolts.remove(hole)
-                sizes = f"its diameter is {2 * hole.radius_mm:.4g} mm, that of the others {2 * usual:.4g} mm"
-                notes.append(_note_omission(face, hole.middle, sizes))
-        if largest.radius_mm < 1.5 * max((hole.radius_mm for hole in bolts), default=0.0):
-            bolts = holes
-        else:
-            values.append(_make_diameter(FeatureKind.FLANGE, "bore", largest))
-        offsets = [np.nan] * len(bolts)
-        if len(bolts) >= 3:
-            circle, offsets = _measure_bolt_circle(bolts)
-            values.append(circle)
-        for number, (hole, offset) in enumerate(zip(bolts, offsets, strict=True), start=1):
-            features.append(_make_hole_feature(face, hole, number, offset))
+    bolts, bore, odd = _sort_holes(face, holes)
+    notes += odd
+    if bore is not None:
+        values.append(_make_diameter(FeatureKind.FLANGE, "bore", bore))
+    offsets = [np.nan] * len(bolts)
+    if len(bolts) >= 3:
+        circle, offsets = _measure_bolt_circle(bolts)
+        values.append(circle)
+    for number, (hole, offset) in enumerate(zip(bolts, offsets, strict=True), start=1):
+        features.append(_make_hole_feature(face, hole, number, offset))
     if datum is not None:
         values.append(_measure_parallelism(cloud, face, used, datum))
     extent = np.append(np.ptp((cloud.points_mm[used] - face.point_mm) @ face.axes[:2].T, axis=0), values[0].value)
     whole = Feature(FeatureKind.FLANGE, "flange", tuple(values), face.point_mm, face.axes, extent, used)
     return _make_inspection("flange", cloud, (whole, *features), [(used, face)], notes)
+
+
+def _sort_holes(face: _Face, holes: list[_Hole]) -> tuple[list[_Hole], _Hole | None, list[str]]:
+    """Return bolt holes, the bore, and notes on others; without a far larger hole, all of them are bolt holes."""
+    if not holes:
+        return [], None, []
+    largest, notes = max(holes, key=lambda hole: hole.radius_mm), list[str]()
+    others = [hole for hole in holes if hole is not largest]
+    usual = float(np.median([hole.radius_mm for hole in others])) if others else 0.0
+    bolts = [hole for hole in others if abs(hole.radius_mm - usual) < _Rule.same_diameter * usual]
+    for hole in others:
+        if hole not in bolts:
+            sizes = f"its diameter is {2 * hole.radius_mm:.4g} mm, that of the others {2 * usual:.4g} mm"
+            notes.append(_note_omission(face, hole.middle, sizes))
+    if largest.radius_mm < 1.5 * max((hole.radius_mm for hole in bolts), default=0.0):
+        return holes, None, notes
+    return bolts, largest, notes
 
 
 def inspect_gap(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:

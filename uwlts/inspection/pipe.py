@@ -126,12 +126,13 @@ def inspect_pipe(
             search = _search_form(cloud, form, chosen, false_alarm)
     features, of_sections = pipe_features(cloud, form, section_mm=section_mm)
     of_welds, on_welds = _weld_features(cloud, form, welds)
-    blemishes, of_blemishes = _blemish_features(cloud, form, chosen, search, wall_mm)
+    blemishes = _Blemishes(cloud, form, chosen, search, wall_mm)
+    features += [*of_welds, *blemishes.measure_all()]
     deviation, level = np.full(len(cloud), np.nan), np.full(len(cloud), np.nan)
     deviation[chosen[~search.outliers]] = form.distance_mm[chosen[~search.outliers]]
     level[chosen] = search.level_mm
-    notes = *regions, *_note_limits(cloud, form, search), *of_size, *off, *of_sections, *on_welds, *of_blemishes
-    found = Inspection("pipe", (*features, *of_welds, *blemishes), deviation, level, notes)
+    notes = *regions, *_note_limits(cloud, form, search), *of_size, *off, *of_sections, *on_welds, *blemishes.notes
+    found = Inspection("pipe", tuple(features), deviation, level, notes)
     return found.consider_cloud(cloud)
 
 
@@ -243,126 +244,154 @@ def _weld_features(cloud: PointCloud, form: PipeForm, welds: list[PipeWeld]) -> 
     return features, notes
 
 
-def _blemish_features(
-    cloud: PointCloud, form: PipeForm, chosen: np.ndarray, search: BlemishSearch, wall_mm: float | None
-) -> tuple[list[Feature], list[str]]:
-    """Return the blemishes as features, and a note on each omitted indication."""
-    errors = PointErrors.along_normals(cloud, chosen, form.frame.normals_at(form.angle[chosen]))
-    flat = _unroll(cloud, form, chosen, form.angle[chosen], errors)
-    measured: list[tuple[Blemish, float, float]] = []
-    notes: list[str] = []
-    unsized: list[tuple[FeatureKind, np.ndarray, float, float, str]] = []
+class _Blemishes:
+    """Blemishes of a pipe: the large ones of a search, each with those inside and beside it, and the others.
 
-    def add_unsized(points: np.ndarray, height: float, bound: float, reason: str) -> None:
-        """Add a finding that is not sized, of some points and a signed height."""
-        kind = FeatureKind.PROTRUSION if height > 0 else FeatureKind.PIT
-        unsized.append((kind, chosen[points], abs(height), bound, f"not sized: {reason}"))
+    ``notes`` name what is omitted.
+    """
 
-    for each in search.unresolved:
-        add_unsized(np.array([each.point]), each.height_mm, each.bound_mm, each.reason)
-    sizes = {"diameter_mm": 2 * form.radius_mm, "wall_mm": wall_mm}
+    def __init__(
+        self, cloud: PointCloud, form: PipeForm, chosen: np.ndarray, search: BlemishSearch, wall_mm: float | None
+    ):
+        self.notes: list[str] = []
+        self._cloud, self._form, self._chosen, self._search = cloud, form, chosen, search
+        self._sizes = {"diameter_mm": 2 * form.radius_mm, "wall_mm": wall_mm}
+        self._errors = PointErrors.along_normals(cloud, chosen, form.frame.normals_at(form.angle[chosen]))
+        self._flat = _unroll(cloud, form, chosen, form.angle[chosen], self._errors)
+        # Blemish, angle about which its surface is unrolled, and probability of a false alarm.
+        self._measured: list[tuple[Blemish, float, float]] = []
+        # Kind, points, height, bound and reason of findings that are not sized.
+        self._unsized: list[tuple[FeatureKind, np.ndarray, float, float, str]] = []
+        self._large: list[LargeBlemish] = []
+        for indication in sorted(search.indications, key=lambda each: abs(each.height_mm), reverse=True):
+            around, _ = self._unroll_about(indication)
+            sides = np.ptp(around.places[indication.points], axis=0)
+            if not self._is_explained(indication) and np.min(sides) >= DENT_SHARE * 2 * form.radius_mm:
+                whole = search_within(around, search, indication)
+                self._large += [] if whole is None else [whole]
 
-    def unroll_about(indication: Indication) -> tuple[UnrolledSurface, float]:
-        """Return the surface unrolled about an indication, so that it is not cut, and its angle."""
-        middle = float(np.angle(np.mean(np.exp(1j * form.angle[chosen[indication.points]]))))
-        places, circumference = flat.places.copy(), 2 * np.pi * form.radius_mm
-        places[:, 1] -= form.radius_mm * middle
-        places[:, 1] -= circumference * np.rint(places[:, 1] / circumference)
-        return replace(flat, places=places), middle
-
-    def measure(indication: Indication, points: np.ndarray, middle: float, measured_by: Callable[[], Blemish]) -> bool:
-        """Add the blemish, or a note and return False; ``points`` are those of the indication."""
-        try:
-            blemish = measured_by()
-        except EvaluationError as error:
-            inside = any(
-                np.isin(points, w.indication.points).all() and w.indication is not indication for w, _ in large
+    def measure_all(self) -> list[Feature]:
+        """Measure all blemishes; return them, the deepest first, and then those that are not sized."""
+        self._add_unresolved(self._search, np.arange(len(self._chosen)))
+        taken = np.zeros(len(self._chosen), bool)
+        for whole in self._large:
+            self._measure_large(whole, taken)
+        for indication in self._search.indications:
+            if not self._is_explained(indication):
+                surface, middle = self._unroll_about(indication)
+                self._measure(indication, indication.points, middle, partial(measure_blemish, surface, self._search))
+        self._measured.sort(key=lambda each: each[0].extent_mm[2], reverse=True)
+        numbers = dict.fromkeys(FeatureKind, 0)
+        found = [*map(self._sized_feature, self._measured), *map(self._unsized_feature, self._unsized)]
+        features = []
+        for feature in found:
+            numbers[feature.kind] += 1
+            features.append(replace(feature, name=f"{feature.kind} {numbers[feature.kind]}"))
+            self.notes += _note_merged(features[-1])
+        if self._measured:
+            along, around = np.median([blemish.spacing_mm for blemish, *_ in self._measured], axis=0)
+            spacing = f"{along:.2g} mm along the pipe, {around:.2g} mm around it, median"
+            self.notes.insert(
+                0,
+                "lengths and widths of findings are known no better than the spacing of profiles and points there "
+                f"({spacing}): their intervals include it at both ends",
             )
-            if inside or isinstance(error, NotSignificantError):
-                notes.append(_note_indication(cloud, chosen[points], indication.height_mm, f"is omitted: {error}"))
-            else:
-                add_unsized(points, indication.height_mm, 0.0, str(error))
-            return False
-        measured.append((blemish, middle, indication.false_alarm))
-        return True
+        return features
 
-    large: list[tuple[LargeBlemish, float]] = []
+    def _unroll_about(self, indication: Indication) -> tuple[UnrolledSurface, float]:
+        """Return the surface unrolled about an indication, so that it is not cut, and its angle."""
+        middle = float(np.angle(np.mean(np.exp(1j * self._form.angle[self._chosen[indication.points]]))))
+        places, circumference = self._flat.places.copy(), 2 * np.pi * self._form.radius_mm
+        places[:, 1] -= self._form.radius_mm * middle
+        places[:, 1] -= circumference * np.rint(places[:, 1] / circumference)
+        return replace(self._flat, places=places), middle
 
-    def is_explained(indication: Indication) -> bool:
+    def _is_explained(self, indication: Indication) -> bool:
         """Return whether an indication is part of a large blemish."""
-        return any(whole.explains(indication) for whole, _ in large)
+        return any(whole.explains(indication) for whole in self._large)
 
-    for indication in sorted(search.indications, key=lambda each: abs(each.height_mm), reverse=True):
-        sides = np.ptp((around := unroll_about(indication))[0].places[indication.points], axis=0)
-        if not is_explained(indication) and np.min(sides) >= DENT_SHARE * 2 * form.radius_mm:
-            whole = search_within(around[0], search, indication)
-            if whole is not None:
-                large.append((whole, around[1]))
-    taken = np.zeros(len(chosen), bool)
-    for whole, middle in large:
-        parts = whole.parts_beside(search.indications)
+    def _measure_large(self, whole: LargeBlemish, taken: np.ndarray) -> None:
+        """Measure a large blemish and those inside and beside it, whose points are marked in ``taken`` (N,)."""
+        large, (surface, middle) = whole.indication, self._unroll_about(whole.indication)
+        parts = whole.parts_beside(self._search.indications)
         formed = [abs(part.height_mm) for part in parts if whole.is_form(part)]
         if formed:
             departs = f"has {len(formed)} departures of up to {max(formed):.2g} mm from a smooth surface, by its form"
-            notes.append(_note_indication(cloud, chosen[whole.indication.points], whole.indication.height_mm, departs))
+            self.notes.append(_note_indication(self._cloud, self._chosen[large.points], large.height_mm, departs))
         for part in parts:
             points = whole.chosen[part.points]
             if not taken[points].any() and not whole.is_form(part):
-                taken[points] = measure(part, points, middle, partial(whole.measure, part, errors, **sizes))
-        for each in whole.search.unresolved:
-            if (point := whole.chosen[each.point]) in whole.indication.points:
-                add_unsized(np.array([point]), each.height_mm, each.bound_mm, each.reason)
-        bare = whole.without(unroll_about(whole.indication)[0], taken)
-        measure_here = partial(measure_blemish, bare, search, whole.indication, errors, **sizes)
-        measure(whole.indication, whole.indication.points, middle, measure_here)
-    for indication in search.indications:
-        if not is_explained(indication):
-            surface, middle = unroll_about(indication)
-            alone = partial(measure_blemish, surface, search, indication, errors, **sizes)
-            measure(indication, indication.points, middle, alone)
-    measured.sort(key=lambda each: each[0].extent_mm[2], reverse=True)
-    features, numbers = [], dict.fromkeys(FeatureKind, 0)
-    for blemish, middle, chance in measured:
-        numbers[blemish.kind] += 1
+                taken[points] = self._measure(part, points, middle, whole.measure)
+        self._add_unresolved(whole.search, whole.chosen, within=large.points)
+        bare = whole.without(surface, taken)
+        self._measure(large, large.points, middle, partial(measure_blemish, bare, self._search))
 
-        def in_cloud(places: np.ndarray, middle: float = middle) -> np.ndarray:
-            """Return points (K, 3) on the pipe at places (K, 2) of the surface unrolled about an angle."""
+    def _measure(
+        self, indication: Indication, points: np.ndarray, middle: float, measure: Callable[..., Blemish]
+    ) -> bool:
+        """Add the blemish, or a note and return False; ``points`` are those of the indication."""
+        try:
+            blemish = measure(indication, self._errors, **self._sizes)
+        except EvaluationError as error:
+            others = [whole.indication.points for whole in self._large if whole.indication is not indication]
+            if isinstance(error, NotSignificantError) or any(np.isin(points, each).all() for each in others):
+                omitted = f"is omitted: {error}"
+                note = _note_indication(self._cloud, self._chosen[points], indication.height_mm, omitted)
+                self.notes.append(note)
+            else:
+                self._add_unsized(points, indication.height_mm, 0.0, str(error))
+            return False
+        self._measured.append((blemish, middle, indication.false_alarm))
+        return True
+
+    def _add_unresolved(self, search: BlemishSearch, chosen: np.ndarray, within: np.ndarray | None = None) -> None:
+        """Add what a search of the ``chosen`` points (M,) did not resolve, if it is ``within`` (K,) some of them."""
+        for each in search.unresolved:
+            point = chosen[each.point]
+            if within is None or point in within:
+                self._add_unsized(np.array([point]), each.height_mm, each.bound_mm, each.reason)
+
+    def _add_unsized(self, points: np.ndarray, height: float, bound: float, reason: str) -> None:
+        """Add a finding that is not sized, of some points and a signed height."""
+        kind = FeatureKind.PROTRUSION if height > 0 else FeatureKind.PIT
+        self._unsized.append((kind, self._chosen[points], abs(height), bound, f"not sized: {reason}"))
+
+    def _sized_feature(self, measured: tuple[Blemish, float, float]) -> Feature:
+        blemish, middle, chance = measured
+        form = self._form
+
+        def in_cloud(places: np.ndarray) -> np.ndarray:
+            """Return points (K, 3) on the pipe at places (K, 2) of the surface unrolled about the angle."""
             return form.points_at(places[:, 0], places[:, 1] / form.radius_mm + middle)
 
         out = form.frame.normals_at(np.array([blemish.place[1] / form.radius_mm + middle]))[0]
-        feature = Feature(
+        return Feature(
             blemish.kind,
-            f"{blemish.kind} {numbers[blemish.kind]}",
+            "",
             blemish.with_spacing(),
             in_cloud(blemish.place[None])[0],
-            np.array([form.frame.axes[2], np.cross(out, form.frame.axes[2]), out]),
+            self._axes(out),
             blemish.extent_mm,
-            chosen[blemish.points],
+            self._chosen[blemish.points],
             chance,
             in_cloud(blemish.outline),
             in_cloud(blemish.hollows),
             blemish.reason,
         )
-        features.append(feature)
-        notes += _note_merged(feature)
-    for kind, points, height, bound, reason in unsized:
-        numbers[kind] += 1
-        place = cloud.points_mm[points].mean(axis=0)
-        out = form.frame.normals_at(form.frame.cylindrical(place[None])[1])[0]
+
+    def _unsized_feature(self, found: tuple[FeatureKind, np.ndarray, float, float, str]) -> Feature:
+        kind, points, height, bound, reason = found
+        place = self._cloud.points_mm[points].mean(axis=0)
+        out = self._form.frame.normals_at(self._form.frame.cylindrical(place[None])[1])[0]
         name = "height" if kind == FeatureKind.PROTRUSION else "depth"
         value = replace(plain_value(kind, name, max(height, bound), 0.0, None), low=bound).as_bound()
-        axes = np.array([form.frame.axes[2], np.cross(out, form.frame.axes[2]), out])
         extent = np.array([0.0, 0.0, height])
-        features.append(Feature(kind, f"{kind} {numbers[kind]}", (value,), place, axes, extent, points, reason=reason))
-    if measured:
-        along, around = np.median([blemish.spacing_mm for blemish, *_ in measured], axis=0)
-        spacing = f"{along:.2g} mm along the pipe, {around:.2g} mm around it, median"
-        notes.insert(
-            0,
-            "lengths and widths of findings are known no better than the spacing of profiles and points there "
-            f"({spacing}): their intervals include it at both ends",
-        )
-    return features, notes
+        return Feature(kind, "", (value,), place, self._axes(out), extent, points, reason=reason)
+
+    def _axes(self, out: np.ndarray) -> np.ndarray:
+        """Return the axes (3, 3) of a feature with an outward normal (3,)."""
+        along = self._form.frame.axes[2]
+        return np.array([along, np.cross(out, along), out])
 
 
 def _note_merged(feature: Feature) -> Iterator[str]:

@@ -297,8 +297,7 @@ def _section_values(
     known = errors.covariances(weights, left, group_neighbours(len(left)))
     diameter = float(2 * (form.radius_mm + coefficients[0]))
     vector, two = coefficients[at], _select_covariance(at, *known)
-    size = max(float(np.linalg.norm(vector)), 1e-12)
-    side = np.degrees(np.array([-vector[1], vector[0]]) / size**2 / 2)
+    side = np.degrees(np.array([-vector[1], vector[0]]) / max(float(np.linalg.norm(vector)), 1e-12) ** 2 / 2)
     angle = 0.5 * float(np.degrees(np.arctan2(vector[1], vector[0])))
     return (
         linear_value(kind, "diameter", diameter, known, 2 * np.eye(5)[0]),

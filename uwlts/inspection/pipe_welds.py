@@ -99,8 +99,7 @@ def measure_weld(cloud: PointCloud, form: PipeForm, weld: PipeWeld, name: str) -
         local[:, 1] *= -1
     axes = np.array([*tangents[nearest], out[nearest]])
     bead = build_bead(cloud, local, tangents, half_mm=weld.half_mm)
-    errors = PointErrors.along_normals(cloud, bead.chosen, out[bead.chosen])
-    values, extent, _ = measure_bead(bead, errors)
+    values, extent, _ = measure_bead(bead, PointErrors.along_normals(cloud, bead.chosen, out[bead.chosen]))
     return Feature(FeatureKind.WELD, name, values, middle, axes, extent, bead.chosen[bead.on_bead])
 
 

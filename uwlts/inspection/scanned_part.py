@@ -329,8 +329,7 @@ def _refine_torus(places: np.ndarray, point: np.ndarray, direction: np.ndarray) 
         limit = max(robust_std(residuals(x)), 1e-6)
         x = np.asarray(least_squares(residuals, x, loss="cauchy", f_scale=2 * limit, max_nfev=60).x)
     left = residuals(x)
-    on = np.abs(left) < 5 * max(robust_std(left), 1e-9)
-    distance = meridian(x)[2][on]
+    distance = meridian(x)[2][np.abs(left) < 5 * max(robust_std(left), 1e-9)]
     turned = np.arctan2(*(distance @ across.T).T)
     turned = np.angle(np.exp(1j * (turned - np.angle(np.mean(np.exp(1j * turned))))))
     return float(x[4]), float(x[6]), float(np.ptp(turned)), robust_std(left)

@@ -59,8 +59,8 @@ class _Rule:
     bandwidth: float = 0.04  # half window of a local quadratic, in bead widths: narrower than an undercut
     spacings_in_bandwidth: float = 3.0  # least half window of a local quadratic, in point spacings
     gap_spacings: float = 0.6
-    """Point spacing divided by the typical gap between points across the bead: they are equal for evenly distributed
-    points, and the gap is larger if images run along the bead."""
+    """Least point spacing, divided by the typical gap between points across the bead. Both are equal for evenly
+    distributed points; if images run along the bead, the gap is larger."""
     flank_low: float = 0.1
     """Lower end of the flank, as a fraction of the bead's height. A line through the flank gives toe and toe angle."""
     flank_high: float = 0.5  # upper end of the flank, as a fraction of the bead's height

@@ -124,8 +124,8 @@ class FournierForand(PhaseFunction):
         """Make the function with a given backscatter fraction.
 
         Index and slope are coupled by index = 1.01 + 0.1542 (slope - 3) (Mobley, Sundman and Boss 2002, Applied Optics
-        41:1035). The formula is quoted from memory and agrees with the published pairs for fractions from 1e-4 to 0.1.
-        Raises RangeError outside this range.
+        41:1035). The formula was not compared with the paper itself; it agrees with the published pairs for fractions
+        from 1e-4 to 0.1. Raises RangeError outside this range.
         """
         check_range("backscatter_share", share, 1e-4, 0.1, "the line of Mobley, Sundman and Boss (2002)")
         # Bisection between slopes with less than the smallest and more than the largest fraction.
@@ -137,7 +137,7 @@ class FournierForand(PhaseFunction):
         return cls(1.01 + 0.1542 * (low - 3), low)
 
     def backscatter_share(self) -> float:
-        """Return the fraction scattered by more than 90 deg (Mobley, Sundman and Boss 2002, Eq. 7, from memory)."""
+        """Return the fraction scattered by more than 90 deg (Mobley, Sundman and Boss 2002, Eq. 7, not compared)."""
         nu, delta = (3 - self.slope) / 2, 2 / (3 * (self.index - 1) ** 2)
         power = delta**nu
         return 1 - (1 - delta * power - 0.5 * (1 - power)) / ((1 - delta) * power)

@@ -6,7 +6,7 @@ its origin at the entrance pupil. All refractive indices are relative to air.
 
 import math
 from itertools import pairwise
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import (
@@ -71,6 +71,11 @@ _INDEX_FORMULA = 1.5e-5  # uncertainty of the formula for the index of water, as
 
 Table = Annotated[dict[str, JsonValue], BeforeValidator(to_jsonable_python), AfterValidator(require_plain)]
 """A table of a TOML or JSON file; code that uses it checks its content."""
+
+
+def to_rows(matrix: np.ndarray) -> tuple[tuple[Any, ...], ...]:
+    """Return the rows of a matrix as descriptions contain them."""
+    return tuple(map(tuple, matrix.tolist()))
 
 
 class Description(BaseModel):

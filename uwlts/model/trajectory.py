@@ -113,8 +113,7 @@ class Trajectory(Brief):
         if self.covariance is None:
             return None
         flat = self.covariance.reshape(len(self.times_s), 36)
-        at = np.stack([np.interp(times_s, self.times_s, column) for column in flat.T], axis=1)
-        return at.reshape(-1, 6, 6)
+        return np.stack([np.interp(times_s, self.times_s, column) for column in flat.T], axis=1).reshape(-1, 6, 6)
 
     def poses_at(self, times_s: np.ndarray) -> np.ndarray:
         """Interpolate ``T_base_platform`` (M, 4, 4), mm, at times (M,); DescriptionError outside the trajectory."""

@@ -324,10 +324,26 @@ def _fit_planes(
 ) -> None:
     """Write slopes (F, L) of planes fitted to the values z (F, L) marked by ``there``, at positions s (F,).
 
-    Running sums over the window, first along each row, then from row to row. Unknown slopes stay as they are.
+    Running sums over the window, first along each row, then from row to row. Unknown slopes are 0.
     """
     count, width = there.shape
-    along = np.zeros((count, 5, width))
+    along, total = np.empty((count, 5, width)), np.zeros((9, width))
+    _sum_along_rows(there, z, columns, along)
+    fewest = _LEAST_SHARE * ((2 * rows + 1) * (2 * columns + 1))
+    for k in range(count + rows):
+        for row, sign in ((k, 1.0), (k - 2 * rows - 1, -1.0)):
+            if 0 <= row < count:
+                _add_row(along[row], s[row], sign, total)
+        if k >= rows:
+            for at in range(width):
+                if there[k - rows, at] and total[0, at] > fewest:
+                    slopes[k - rows, at] = _solve_slope(total[:, at], least)
+
+
+@compiled
+def _sum_along_rows(there: np.ndarray, z: np.ndarray, columns: int, along: np.ndarray) -> None:
+    """Fill the sums (F, 5, L) of 1, x, x^2, z and x z over the marked values within ``columns`` in their row."""
+    count, width = there.shape
     for row in range(count):
         n, x1, x2, z1, xz = 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(width + columns):
@@ -339,33 +355,31 @@ def _fit_planes(
             if k >= columns:
                 to = along[row, :, k - columns]
                 to[0], to[1], to[2], to[3], to[4] = n, x1, x2, z1, xz
-    size = (2 * rows + 1) * (2 * columns + 1)
-    total = np.zeros((9, width))
-    for k in range(count + rows):
-        for row, sign in ((k, 1.0), (k - 2 * rows - 1, -1.0)):
-            if 0 <= row < count:
-                for at in range(width):
-                    n, x1, z1 = sign * along[row, 0, at], sign * along[row, 1, at], sign * along[row, 3, at]
-                    total[0, at] += n
-                    total[1, at] += x1
-                    total[2, at] += sign * along[row, 2, at]
-                    total[3, at] += z1
-                    total[4, at] += sign * along[row, 4, at]
-                    total[5, at] += s[row] * n
-                    total[6, at] += s[row] * s[row] * n
-                    total[7, at] += s[row] * x1
-                    total[8, at] += s[row] * z1
-        if k < rows:
-            continue
-        for at in range(width):
-            n = total[0, at]
-            if not there[k - rows, at] or n <= _LEAST_SHARE * size:
-                continue
-            mx, mz, ms = total[1, at] / n, total[3, at] / n, total[5, at] / n
-            xx, xz = total[2, at] / n - mx * mx, total[4, at] / n - mx * mz
-            if xx <= 1.0:
-                continue
-            ss, sx, sz = total[6, at] / n - ms * ms, total[7, at] / n - ms * mx, total[8, at] / n - ms * mz
-            of_both = ss * xx - sx * sx
-            if least < ss < _REACH_MM**2 and of_both > 1e-3 * ss * xx:
-                slopes[k - rows, at] = (sz * xx - xz * sx) / of_both
+
+
+@compiled
+def _add_row(row: np.ndarray, s: float, sign: float, total: np.ndarray) -> None:
+    """Add a row's sums (5, L) to those over rows (9, L), which also contain s, s^2, s x and s z."""
+    for at in range(row.shape[1]):
+        n, x1, z1 = sign * row[0, at], sign * row[1, at], sign * row[3, at]
+        total[0, at] += n
+        total[1, at] += x1
+        total[2, at] += sign * row[2, at]
+        total[3, at] += z1
+        total[4, at] += sign * row[4, at]
+        total[5, at] += s * n
+        total[6, at] += s * s * n
+        total[7, at] += s * x1
+        total[8, at] += s * z1
+
+
+@compiled
+def _solve_slope(total: np.ndarray, least: float) -> float:
+    """Return the slope by s of the plane with given sums (9,); 0 if they do not determine it."""
+    n = total[0]
+    mx, mz, ms = total[1] / n, total[3] / n, total[5] / n
+    xx, xz = total[2] / n - mx * mx, total[4] / n - mx * mz
+    ss, sx, sz = total[6] / n - ms * ms, total[7] / n - ms * mx, total[8] / n - ms * mz
+    of_both = ss * xx - sx * sx
+    known = xx > 1.0 and least < ss < _REACH_MM**2 and of_both > 1e-3 * ss * xx
+    return (sz * xx - xz * sx) / of_both if known else 0.0

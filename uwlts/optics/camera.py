@@ -243,8 +243,7 @@ def _undistort(d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray) -> tuple[n
     """Invert `_distort` in its domain about the centre; NaN outside the image of the domain."""
     allowed = _is_allowed(x_seen, y_seen)
     with np.errstate(all="ignore"):
-        s = x_seen * x_seen + y_seen * y_seen
-        start = 1.0 / _radial(d, s)
+        start = 1.0 / _radial(d, x_seen * x_seen + y_seen * y_seen)
         x, y = start * x_seen, start * y_seen
         found = np.zeros(len(x), dtype=bool)
         for _ in range(_USUAL_STEPS):

@@ -416,8 +416,7 @@ class SheetGeometry:
 
     def crossing_motion(self) -> np.ndarray:
         """Return the motion (3,) in the sheet per pixel across the stripe, where the camera's axis meets the sheet."""
-        crossing = self.point(0.0)
-        y, z = self.mm_per_pixel(self.project(np, crossing))
+        y, z = self.mm_per_pixel(self.project(np, self.point(0.0)))
         return np.ravel(y) * np.array(self.laser.fan) + np.ravel(z) * np.array(self.laser.axis)
 
 

@@ -11,7 +11,7 @@ from uwlts.model.calibration import Calibration, CameraModel, SheetModel, Window
 from uwlts.model.library import load_sensor
 from uwlts.model.media import GLASSES
 from uwlts.model.placement import camera_from_object, laser_pose, view_of_sheet
-from uwlts.model.sensor import Medium, Sensor
+from uwlts.model.sensor import Medium, Sensor, to_rows
 from uwlts.optics.design import (
     FARTHEST_MM,
     SheetGeometry,
@@ -76,7 +76,7 @@ def nominal_calibration(sensor: Sensor, medium: Medium | None = None) -> Calibra
         if camera.window.mounted
         else None,
         sheet=_sheet(sensor, medium),
-        camera_from_object=tuple(map(tuple, camera_from_object(sensor))),
+        camera_from_object=to_rows(camera_from_object(sensor)),
         provenance={"source": f"description of the sensor '{sensor.name}'"},
     )
 

@@ -76,25 +76,9 @@ def refract(directions: np.ndarray, normal: np.ndarray, *, ratio: float) -> tupl
     with Eq. 3.6 of the thesis, the equation sends the ray backwards. Here the normal may point to either side: the sign
     of the square root is that of the cosine between ray and normal.
 
-    Parameters
-    ----------
-    directions : (N, 3)
-        Unit vectors of the incident rays; a row of NaN stays NaN.
-    normal : (3,) or (N, 3)
-        Unit normal of the interface, for all rays or for each.
-    ratio : float
-        Index before the interface divided by the index behind it.
-
-    Returns
-    -------
-    refracted : (N, 3)
-        Unit vectors, NaN where the ray is totally reflected.
-    total_reflection : (N,) bool
-
-    Raises
-    ------
-    RangeError
-        The ratio is not finite and positive.
+    ``directions`` (N, 3) are unit vectors, ``normal`` (3,) or (N, 3) is the unit normal of the interface. ``ratio`` is
+    the index before the interface divided by that behind it. Returns unit vectors (N, 3), NaN for rays that are NaN or
+    totally reflected, and whether they are totally reflected (N,). RangeError if the ratio is not finite and positive.
     """
     check_index("the ratio of refractive indices", ratio)
     rays, normal = np.asarray(directions, dtype=float).T, np.asarray(normal, dtype=float)

@@ -223,8 +223,7 @@ def new_figure(
 
     figure = make_figure(width, height, shown=shown)
     with matplotlib.rc_context(_STYLE):
-        axes = figure.subplots(rows, columns, squeeze=False)
-        return figure, list(axes.flat)
+        return figure, list(figure.subplots(rows, columns, squeeze=False).flat)
 
 
 def legend_below(figure: Figure, *, columns: int = 4) -> None:
@@ -352,5 +351,4 @@ def format_fixed(value: float | None, decimals: int = 3, *, signed: bool = False
 
 def format_to_scale(value: float, scale: float, *, digits: int = 3) -> str:
     """Format a number with as many decimals as a scale with some significant digits has."""
-    decimals = digits - 1 - math.floor(math.log10(scale)) if scale > 0 else 3
-    return format_fixed(value, max(0, decimals))
+    return format_fixed(value, max(0, digits - 1 - math.floor(math.log10(scale)) if scale > 0 else 3))

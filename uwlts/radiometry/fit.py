@@ -416,7 +416,7 @@ class _Evidence:
                 "halo beside the stripe",
                 shape_dn / most_of_shape,
                 f"{shape_dn:.3g} DN beside the model, of {brightest:.3g} DN; translucent surface or daylight?",
-                ("power_reflectance_mw", "scattering_per_m", "sheet_radius_mm", "background_dn"),
+                ("power_reflectance_mw", "attenuation_per_m", "scattering_per_m", "sheet_radius_mm", "background_dn"),
             ),
             PartFit(
                 "background over the scan",

@@ -153,8 +153,7 @@ def outlook(
     attenuation = value["attenuation_per_m"]
     if not determined:
         attenuation = 1e3 * header.medium.extinction_per_mm(sensor.laser.wavelength_nm)
-    power = value["power_reflectance_mw"]
-    whole = exposure * light.grey_per_mw * power * np.exp(-1e-3 * attenuation * paths)
+    whole = exposure * light.grey_per_mw * value["power_reflectance_mw"] * np.exp(-1e-3 * attenuation * paths)
     peak = whole / (math.sqrt(2 * math.pi) * math.hypot(value["stripe_sigma_px"], math.sqrt(1 / 12)))
     options = StripeOptions.resolve(sensor, None)
     noise = value.get("dark_noise_dn", sensor.detector.gain_dn_per_e() * sensor.detector.read_noise_e)

@@ -86,8 +86,7 @@ def fill_gaps(stripes: CaptureStripes) -> CaptureStripes:
 
     Lines without a centre are dim by chance; without them, a faint stripe would seem brighter than it is.
     """
-    same = np.diff(stripes.frame) == 0
-    missing = np.where(same, np.diff(stripes.line) - 1, 0)
+    missing = np.where(np.diff(stripes.frame) == 0, np.diff(stripes.line) - 1, 0)
     short = (missing > 0) & (missing <= LONGEST_GAP)
     before = np.repeat(np.flatnonzero(short), missing[short])
     step = np.concatenate([np.arange(1, count + 1) for count in missing[short].tolist()] or [np.empty(0, int)])
@@ -306,8 +305,7 @@ def _measure_variance(images: np.ndarray) -> np.ndarray:
     cell = np.digitize(above, np.geomspace(2.0, max(float(above.max()), 4.0), _BINS))
     most = np.array([np.median(variance[cell == k]) if (cell == k).any() else 0.0 for k in range(_BINS + 1)])
     most = np.maximum(most, _ROUNDING) * limit / float(chi2.median(freedom))
-    kept = variance <= most[cell]
-    return np.where(kept, variance * _STILL / float(chi2.cdf(limit, freedom + 2)), np.nan)
+    return np.where(variance <= most[cell], variance * _STILL / float(chi2.cdf(limit, freedom + 2)), np.nan)
 
 
 def _find_repeats(capture: Capture) -> list[np.ndarray]:
@@ -339,8 +337,7 @@ def _judge_transfer(counted: np.ndarray, background_dn: float, gain: float, dark
     A variance with f degrees of freedom has the relative standard deviation sqrt(2 / f).
     """
     count, means, variances = counted[:, counted[0] > _FEWEST_PIXELS]
-    expected = np.maximum(gain * (means / count - background_dn) + dark + _ROUNDING, 1e-3)
-    rest = variances / count / expected - 1
+    rest = variances / count / np.maximum(gain * (means / count - background_dn) + dark + _ROUNDING, 1e-3) - 1
     misfit = math.sqrt(np.sum(rest**2 / (2 / (freedom * count) + _TRANSFER_MISFIT**2)) / (len(rest) - 2))
     largest = 100 * float(np.abs(rest).max())
     return PartFit(

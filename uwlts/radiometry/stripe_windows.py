@@ -223,7 +223,7 @@ def measure_windows(images: ImageSet, *, most_images: int) -> StripeWindows:
         )
         profiles = (image if images.stripe_along == "height" else image.T).astype(np.float32) / images.full_dn
         windows = []
-        for lines in _windows(stripe, images.options.jump_px):
+        for lines in _cut_windows(stripe, images.options.jump_px):
             if (found := _measure(profiles[lines], stripe, lines)) is not None:
                 values.append(found)
                 numbers.append(number)
@@ -234,7 +234,7 @@ def measure_windows(images: ImageSet, *, most_images: int) -> StripeWindows:
     return StripeWindows(images.name, table, np.array(numbers, int), tuple(pictures))
 
 
-def _windows(stripe: Stripe, jump_px: float) -> Iterator[np.ndarray]:
+def _cut_windows(stripe: Stripe, jump_px: float) -> Iterator[np.ndarray]:
     """Yield the lines (`WINDOW_LINES`,) of all windows."""
     found = stripe.lines
     gaps = (np.diff(found) > LONGEST_GAP + 1) | (np.abs(np.diff(stripe.centre_px[found])) > jump_px)

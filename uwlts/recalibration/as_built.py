@@ -9,7 +9,7 @@ from uwlts.errors import CalibrationError
 from uwlts.model.calibration import Calibration, KnownMedium
 from uwlts.model.joint_estimate import JointEstimate
 from uwlts.model.parameter_keys import LensParameter, MediumIndex, ParameterKey
-from uwlts.model.sensor import Medium, Sensor
+from uwlts.model.sensor import Medium, Sensor, to_rows
 from uwlts.optics.nominal import nominal_calibration
 
 _FOCAL = 0.01
@@ -49,7 +49,7 @@ def as_built(sensor: Sensor, medium: Medium) -> Calibration:
         values=tuple(prior.mean for prior in entries.values()),
         std=std,
         std_before=std,
-        covariance=tuple(map(tuple, np.diag(np.square(std)).tolist())),
+        covariance=to_rows(np.diag(np.square(std))),
         nominal_sheet=sheet.nominal(),
         scatter_px={},
         residual_count=0,

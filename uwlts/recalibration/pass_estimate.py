@@ -19,6 +19,7 @@ from uwlts.fitting.least_squares import biweight
 from uwlts.model.artefacts import Artefact
 from uwlts.model.calibration import Calibration, calibration_digest, rigid_transform
 from uwlts.model.mount import Mount, SensorShare
+from uwlts.model.sensor import to_rows
 from uwlts.recalibration.known_lengths import KnownLengths, measure_known_lengths
 from uwlts.recalibration.surface_cells import Cell, PassPoints, divide, observe
 
@@ -244,7 +245,7 @@ def move_calibration(known: StoredEstimate, values: np.ndarray) -> Calibration:
             "camera": parameters.camera(values),
             "window": parameters.window_model(values),
             "sheet": sheet,
-            "camera_from_object": _rows(frame),
+            "camera_from_object": to_rows(frame),
         }
     )
 
@@ -393,12 +394,12 @@ def move_mount(mount: Mount, problem: PassProblem, solution: PassSolution, calib
     by_parameters = shared[:6] @ (inverse / np.outer(std, std))
     independent = of_mount[:6, :6] - by_parameters @ shared[:6].T
     changes: dict[str, object] = {
-        "T_platform_sensor": _rows(transform),
-        "covariance": _rows(0.5 * (of_mount + of_mount.T)[:6, :6]),
+        "T_platform_sensor": to_rows(transform),
+        "covariance": to_rows(0.5 * (of_mount + of_mount.T)[:6, :6]),
         "sensor": SensorShare(
             calibration=calibration_digest(calibration),
-            by_parameters=_rows(by_parameters),
-            covariance_apart=_rows(0.5 * (independent + independent.T)),
+            by_parameters=to_rows(by_parameters),
+            covariance_apart=to_rows(0.5 * (independent + independent.T)),
         ),
     }
     change = by @ components
@@ -412,7 +413,3 @@ def move_mount(mount: Mount, problem: PassProblem, solution: PassSolution, calib
         changes["robot_scale_std"] = scale * float(np.sqrt(solution.covariance[count, count]))
     before, after = np.linalg.norm(by, axis=1), np.sqrt(np.einsum("iu,uv,iv->i", by, covariance, by))
     return MovedMount(mount.model_copy(update=changes), change, before, after)
-
-
-def _rows(matrix: np.ndarray) -> tuple[tuple[float, ...], ...]:
-    return tuple(map(tuple, matrix.tolist()))

@@ -19,7 +19,7 @@ from uwlts.model.calibration import Calibration, KnownMedium, KnownStage, calibr
 from uwlts.model.library import load_sensor
 from uwlts.model.mount import Mount
 from uwlts.model.parameter_keys import ParameterKey
-from uwlts.model.sensor import CaptureHeader, Medium
+from uwlts.model.sensor import CaptureHeader, Medium, to_rows
 from uwlts.model.short_text import Brief
 from uwlts.model.trajectory import Trajectory
 from uwlts.optics.brightness import select_sharp_lines
@@ -342,7 +342,9 @@ class KnownPasses:
             posed = add_platform_poses(scan, ride, self._mount)
             found, doubts = _gather(scan, posed, ride.rates, prior, None, self._stripe)
             doubts = [*ride.doubts, *doubts]
-        _refuse_repeated([*self._passes, *found])
+        for one, other in combinations([*self._passes, *found], 2):
+            if np.array_equal(one.centre_px, other.centre_px):
+                raise CaptureError(f"{other.name} holds the same stripes as {one.name}: give each pass once")
         self._passes += found
         self._warnings += [text if scan.path.name in text else f"{scan.path.name}: {text}" for text in doubts]
         exact = "the mount counts as exact: give `mount`, or state poses whose uncertainty contains it"
@@ -372,12 +374,6 @@ def _read_prior(given: Calibration | str | Path, medium: Medium) -> Calibration:
         prior = as_built(load_sensor(given), medium) if built else read_calibration(given)
     require_joint(prior)
     return prior
-
-
-def _refuse_repeated(passes: Sequence[Pass]) -> None:
-    for one, other in combinations(passes, 2):
-        if np.array_equal(one.centre_px, other.centre_px):
-            raise CaptureError(f"{other.name} holds the same stripes as {one.name}: give each pass once")
 
 
 def _make_problem(
@@ -632,7 +628,7 @@ def _build(
             "values": tuple(moved.values.tolist()),
             "std": tuple(np.sqrt(np.diag(covariance)).tolist()),
             "std_before": tuple(old.get(key, float(std)) for key, std in zip(keys, before, strict=True)),
-            "covariance": tuple(map(tuple, covariance.tolist())),
+            "covariance": to_rows(covariance),
         }
     )
     provenance = prior.provenance | {

@@ -91,8 +91,7 @@ def divide(places_mm: np.ndarray, size_mm: float) -> np.ndarray:
 
     Cells border on each other across the surface, never along it: a border along it would select points by their noise.
     """
-    cubes = np.floor(places_mm / size_mm).astype(np.int64)
-    _, owner = np.unique(cubes, axis=0, return_inverse=True)
+    _, owner = np.unique(np.floor(places_mm / size_mm).astype(np.int64), axis=0, return_inverse=True)
     owner = owner.ravel()
     for _ in range(2):
         counts = np.bincount(owner)
@@ -142,8 +141,7 @@ def _observe(points: PassPoints, some: np.ndarray, spread: float, *, fewest: int
         surface = np.column_stack([np.ones_like(u), u, v, u * u, u * v, v * v])
         # Offset and slopes of all passes but one, so that their disagreement is no scatter.
         others = points.number[some, None] == enough[1:]
-        terms = (others[:, :, None] * surface[:, None, :3]).reshape(len(some), -1)
-        design = np.hstack([surface, terms])
+        design = np.hstack([surface, (others[:, :, None] * surface[:, None, :3]).reshape(len(some), -1)])
         if not keep and np.linalg.cond(design) > _CONDITION:
             return None
         shape = np.linalg.lstsq(surface, w, rcond=None)[0] / size

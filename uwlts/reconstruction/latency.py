@@ -50,8 +50,8 @@ def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s:
             "needed (both_ways = true)"
         )
     there, back = (frames[np.argsort(stage_mm[frames])] for frames in (there, back))
-    surface = _Surface.from_centres(stage_mm[there], centre_px[there])
-    backward = _Surface.from_centres(stage_mm[back], centre_px[back])
+    surface = _CentreCurves.from_centres(stage_mm[there], centre_px[there])
+    backward = _CentreCurves.from_centres(stage_mm[back], centre_px[back])
     speed = float(np.median(speed_mm_per_s[there]) - np.median(speed_mm_per_s[back])) / 2
     # A backward frame at x shows the same as the forward pass at x - 2 v latency.
     step = float(np.median(np.diff(surface.position))) / 2
@@ -91,7 +91,7 @@ def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s:
     return shift / (2 * speed), std / (2 * speed)
 
 
-def _cost(surface: "_Surface", backward: "_Surface", shift: float) -> tuple[float, float]:
+def _cost(surface: "_CentreCurves", backward: "_CentreCurves", shift: float) -> tuple[float, float]:
     """Return the mean capped distance, px, of the backward pass at a shift, and the sum of squared slopes."""
     residual, slope, _ = surface.compare(backward, shift)
     if len(residual) < _FEWEST:
@@ -100,7 +100,7 @@ def _cost(surface: "_Surface", backward: "_Surface", shift: float) -> tuple[floa
 
 
 @dataclass(frozen=True, eq=False)
-class _Surface:
+class _CentreCurves:
     """Stripe centres (N, L) as a function of the position (N,), with cubic Hermite interpolation between frames."""
 
     position: np.ndarray
@@ -108,7 +108,7 @@ class _Surface:
     slope: np.ndarray
 
     @classmethod
-    def from_centres(cls, position: np.ndarray, centre: np.ndarray) -> "_Surface":
+    def from_centres(cls, position: np.ndarray, centre: np.ndarray) -> "_CentreCurves":
         spacing = position[2:] - position[:-2]
         slope = np.full_like(centre, np.nan)
         across = centre[2:] - centre[:-2]
@@ -119,7 +119,7 @@ class _Surface:
         slope[1:-1] = np.where(smooth, across / spacing[:, None], np.nan)
         return cls(position, centre, slope)
 
-    def compare(self, other: "_Surface", shift: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def compare(self, other: "_CentreCurves", shift: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Compare the centres of another pass at x with those of this pass at x - shift.
 
         Returns the distances (K,), px, and the slopes (K,) of this and of the other pass, px/mm. Only places between

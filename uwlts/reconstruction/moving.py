@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.fitting.next_observation import CovarianceRoot
 from uwlts.model.mount import Mount
+from uwlts.model.sensor import to_rows
 from uwlts.model.trajectory import Trajectory, convert_to_platform_clock, format_time
 from uwlts.runtime.compiled import compiled
 from uwlts.storage.capture import Capture, FrameTable
@@ -73,6 +74,22 @@ class PlatformPoses:
     doubts: tuple[str, ...] = ()  # warnings about the trajectory
     margins_s: tuple[float, float] | None = None  # of the trajectory before and after the images
 
+    def __getitem__(self, images: np.ndarray) -> "PlatformPoses":
+        """Return the poses at some images (M,)."""
+        covariance, rates = (None if each is None else each[images] for each in (self.covariance, self.rates))
+        return PlatformPoses(self.poses[images], covariance, self.times_s[images], rates)
+
+
+@dataclass(eq=False)
+class ErrorPatterns:
+    """Weights of independent errors in the patterns of a cloud's parts, chosen for the first points and then kept.
+
+    ``of_path`` are times (T,), temporal modes (K, T) and weights (6 K, C) of pose errors.
+    """
+
+    of_sensor: np.ndarray | None = None
+    of_path: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+
 
 def find_platform_poses(
     capture: Capture,
@@ -124,7 +141,7 @@ def add_platform_poses(capture: Capture, ride: PlatformPoses, mount: Mount | Non
     """Return the frames of a capture with the poses of the platform and the transform of the mount."""
     header = capture.header
     if mount is not None:
-        header = header.model_copy(update={"T_platform_sensor": tuple(map(tuple, mount.transform().tolist()))})
+        header = header.model_copy(update={"T_platform_sensor": to_rows(mount.transform())})
     known = capture.stage_mm, capture.exposure_ms, ride.poses, capture.speed_mm_per_s
     return FrameTable(header, capture.path, *known)
 
@@ -138,14 +155,17 @@ def add_platform_uncertainty(
     *,
     mount_covariance: np.ndarray | None = None,
     correlation_s: float | None = None,
+    chosen: ErrorPatterns | None = None,
 ) -> PointUncertainty:
     """Add the uncertainty of mount, time offset and poses to that of points (N, 3) in the base frame.
 
     ``mount_covariance`` (6, 6) replaces the mount's own covariance if ``uncertainty`` already contains a part of it.
     ``correlation_s`` is the correlation time of pose errors, 0 for independent errors. By default it is 0 without a
     trajectory; with a trajectory, the correlation is that of a navigation filter. Images without a covariance have no
-    pose uncertainty.
+    pose uncertainty. Parts of one cloud have the patterns ``chosen`` in common.
     """
+    images, frame = np.unique(frame, return_inverse=True)
+    ride = ride[images]
     levers, errors, poses_mm = points_mm - ride.poses[frame, :3, 3], [], uncertainty.poses_mm
     count, shared = len(uncertainty.patterns_mm), dict(uncertainty.shared)
     if mount is not None:
@@ -163,12 +183,14 @@ def add_platform_uncertainty(
         if correlation_s is None and ride.rates is None:
             correlation_s = 0.0
         if correlation_s != 0:
-            of_path = _path_errors(ride, np.flatnonzero(np.bincount(frame)), correlation_s)
-            some = sample_indices(len(frame))
-            parts = principal_components(
-                propagate_pose_errors(of_path, frame[some], levers[some]), left=_LEFT_OF_SHAPES
-            )
-            errors.append(of_path @ parts)
+            chosen = ErrorPatterns() if chosen is None else chosen
+            modes = _path_modes(ride, correlation_s) if chosen.of_path is None else chosen.of_path[:2]
+            of_path = _path_errors(ride, *modes)
+            if chosen.of_path is None:
+                some = sample_indices(len(frame))
+                shifts = propagate_pose_errors(of_path, frame[some], levers[some])
+                chosen.of_path = *modes, principal_components(shifts, left=_LEFT_OF_SHAPES)
+            errors.append(of_path @ chosen.of_path[2])
             left = left - errors[-1] @ errors[-1].transpose(0, 2, 1)
         poses_mm = propagate_pose_errors(root_covariances(left), frame, levers)
     if not errors:
@@ -189,18 +211,19 @@ def _mount_errors(poses: np.ndarray, place_mm: np.ndarray, root: np.ndarray) -> 
     return np.concatenate([shifts - np.cross(turns, (poses[:, :3, :3] @ place_mm)[:, :, None], axis=1), turns], axis=1)
 
 
-def _path_errors(ride: PlatformPoses, used: np.ndarray, correlation_s: float | None) -> np.ndarray:
-    """Return independent errors (F, 6, K) of the poses of some images (U,) along a path, by temporal modes."""
-    covariances, times = ride.covariance, ride.times_s
-    assert covariances is not None
-    some = used[sample_indices(len(used), _MOST_MOMENTS)]
-    shapes = _temporal_modes(_pose_correlation(covariances[some], times[some], correlation_s))
-    at_images = np.stack([np.interp(times[used], times[some], shape) for shape in shapes], axis=1)
-    result = np.zeros((*covariances.shape[:2], 6 * len(shapes)))
-    result[used] = (root_covariances(covariances[used])[:, :, None] * at_images[:, None, :, None]).reshape(
-        len(used), 6, -1
-    )
-    return result
+def _path_modes(ride: PlatformPoses, correlation_s: float | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return times (T,) of a path, and the temporal modes (K, T) of the errors of its poses."""
+    assert ride.covariance is not None
+    some = sample_indices(len(ride.times_s), _MOST_MOMENTS)
+    times = ride.times_s[some]
+    return times, _temporal_modes(_pose_correlation(ride.covariance[some], times, correlation_s))
+
+
+def _path_errors(ride: PlatformPoses, times_s: np.ndarray, modes: np.ndarray) -> np.ndarray:
+    """Return independent errors (F, 6, 6 K) of poses along a path, by temporal modes (K, T) at times (T,)."""
+    assert ride.covariance is not None
+    at = np.stack([np.interp(ride.times_s, times_s, mode) for mode in modes], axis=1)
+    return (root_covariances(ride.covariance)[:, :, None] * at[:, None, :, None]).reshape(len(at), 6, -1)
 
 
 def _pose_correlation(covariances: np.ndarray, times_s: np.ndarray, correlation_s: float | None) -> np.ndarray:

@@ -23,7 +23,7 @@ from uwlts.model.parameter_keys import StageParameter
 from uwlts.model.sensor import Sensor
 from uwlts.optics.brightness import BLUR_STD, brightness_shift_std
 from uwlts.optics.line_table import LineTable, sum_terms
-from uwlts.reconstruction.moving import principal_components
+from uwlts.reconstruction.moving import ErrorPatterns, principal_components
 from uwlts.runtime.compiled import compiled
 from uwlts.storage.capture import Capture, CaptureHeader, FrameTable, sensor_poses
 from uwlts.storage.cloud import WATER, PointUncertainty
@@ -127,6 +127,7 @@ def point_uncertainty(
     beside_mm: np.ndarray | None = None,
     mount_by: np.ndarray | None = None,
     digest: str | None = None,
+    chosen: ErrorPatterns | None = None,
 ) -> PointUncertainty:
     """Calculate the uncertainty of points from stripe centres (N,) and a joint calibration.
 
@@ -141,7 +142,8 @@ def point_uncertainty(
     ``mount_by`` (6, P) are the derivatives of a calibrated mount by the parameters of the joint estimate
     (`uwlts.model.mount.SensorShare`), for frames with poses of a platform. They correlate the errors of points and
     mount. By default poses and described mount, or the stage, place the true OCS, from which the calibrated one differs
-    by the errors of camera axis and sheet. ``digest`` is that of the calibration, if known.
+    by the errors of camera axis and sheet. ``digest`` is that of the calibration, if known. Parts of one cloud have the
+    patterns ``chosen`` in common.
 
     CalibrationError if the calibration has no joint estimate, or cannot reconstruct the points.
     """
@@ -196,9 +198,11 @@ def point_uncertainty(
         return random, sums
 
     # Patterns are smooth over the points, so that a sample determines the principal ones.
-    few = slice(None, None, max(1, len(line) // _SAMPLED))
-    sampled = moved(few, np.eye(2 + len(by_stage)))[1]
-    weights = principal_components(sampled, left_mm=_NEGLIGIBLE_MM)
+    chosen = ErrorPatterns() if chosen is None else chosen
+    if chosen.of_sensor is None:
+        sampled = moved(slice(None, None, max(1, len(line) // _SAMPLED)), np.eye(2 + len(by_stage)))[1]
+        chosen.of_sensor = principal_components(sampled, left_mm=_NEGLIGIBLE_MM)
+    weights = chosen.of_sensor
     random, patterns = moved(slice(None), weights)
     if not np.isfinite(random).all():
         raise CalibrationError("the calibration's joint estimate gives no point for some stripe centre")
@@ -208,8 +212,7 @@ def point_uncertainty(
     # Except for blur, the errors of sensor, stage and water are common to all scans in this medium.
     source = f"{digest or calibration_digest(calibration)} {header.medium_name} {header.stage_direction}"
     name = sha256(source.encode()).hexdigest()[:16]
-    of_sensor_parts = np.delete(weights, [0, 2], axis=0)
-    shared = {f"{WATER} {name}": weights[2:3].T, f"sensor {name}": of_sensor_parts.T}
+    shared = {f"{WATER} {name}": weights[2:3].T, f"sensor {name}": np.delete(weights, [0, 2], axis=0).T}
     return PointUncertainty(random, position, patterns, shared=shared)
 
 
@@ -318,8 +321,7 @@ def stage_components(
         StageParameter.SCALE: described
     }
     calibrated = [key for key in ways if key in keys and (key not in SLOPES or found is not None)]
-    lean = uncertainty.stage_lean()
-    std = dict.fromkeys(SLOPES, lean) | {StageParameter.SCALE: uncertainty.stage_scale}
+    std = dict.fromkeys(SLOPES, uncertainty.stage_lean()) | {StageParameter.SCALE: uncertainty.stage_scale}
     within = sum((np.outer(root[keys.index(key)], ways[key]) for key in calibrated), np.zeros((root.shape[1], 3)))
     if found is not None:
         # An estimated direction turns with the OCS, a described one does not.

@@ -1,13 +1,16 @@
 """Reconstruction of point clouds from the stripes of all laser images, with any kind of calibration."""
 
 import math
+from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from uwlts.errors import CalibrationError, DescriptionError
+from uwlts.errors import CalibrationError, CaptureError, DescriptionError
 from uwlts.files.json_files import EDITED
 from uwlts.fitting.least_squares import robust_std
 from uwlts.model.calibration import AnyCalibration, Calibration, PolynomialCalibration, calibration_digest
@@ -19,23 +22,30 @@ from uwlts.optics.brightness import IlluminatedPoints, fit_brightness_slopes, fo
 from uwlts.optics.fitness import check_fits
 from uwlts.optics.triangulation import MeasuredPoints, reconstruct_by_polynomials, reconstruct_profile, stage_travel
 from uwlts.optics.window import RayStatus, require_index
-from uwlts.reconstruction.moving import add_platform_poses, add_platform_uncertainty, find_platform_poses
+from uwlts.reconstruction.moving import ErrorPatterns, add_platform_poses, add_platform_uncertainty, find_platform_poses
 from uwlts.reconstruction.point_uncertainty import MOST_CORRELATED, measure_correlation, point_uncertainty
 from uwlts.runtime.compiled import compiled
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.calibration_file import describe_verification, resolve_calibration
 from uwlts.storage.capture import NO_STAGE, Capture, FrameTable, open_capture, sensor_poses
-from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, VERIFIED, PointCloud
+from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, VERIFIED, PointCloud, concatenate_clouds
 from uwlts.storage.mount_files import read_mount
 from uwlts.storage.number_tables import Unit
 from uwlts.storage.pose_files import PoseFormat, read_trajectory
 from uwlts.stripe import StripeSettings, find_stripes
-from uwlts.stripe.capture_stripes import FEWEST_LINES
+from uwlts.stripe.capture_stripes import FEWEST_LINES, find_stripes_in_parts
 
 _OTHER_WATER = 1e-3
 """Difference of refractive indices beyond 10 K of temperature or 5 g/kg of salinity; it changes lengths by 0.07 %."""
 _NOISE_SAMPLED = 100_000
 """Number of stripe centres that show whether their noise is correlated."""
+_PART = 500_000
+"""Least number of points in a part of a long scan: with their uncertainty they take 1 kB each while they are found."""
+_SAMPLED_IMAGES, _SAMPLED_LINES = 400, 4
+"""Images that determine the patterns of a long scan, as many as the temporal modes of a path. Of its sample of points,
+every fourth line is kept, which the check of overlaps uses."""
+_KEPT_IMAGES = 3000
+"""Images of that sample: 150 points of each, with their uncertainty, take some 200 MB."""
 _BESIDE_NOISE, _BESIDE_OTHERS, _USUAL = 2.0, 5.0, 0.9
 """Strange distance of a stripe from where its neighbours let expect it, in standard deviations of centres, and in the
 largest of the usual fraction of images. Chosen on ten scans of thesis-small, at most 0.4 of the noise, and on exchanged
@@ -56,6 +66,7 @@ def reconstruct(
     stripe: StripeSettings = None,
     index: float | None = None,
     with_uncertainty: bool | None = None,
+    take: Callable[[PointCloud], object] | None = None,
     progress: ProgressListener = ignore_progress,
 ) -> PointCloud:
     """Turn a capture into a point cloud: find the stripes of all laser images and triangulate them.
@@ -94,6 +105,9 @@ def reconstruct(
     with_uncertainty : bool, optional
         Calculate the uncertainty of the points, which requires a joint calibration; by default if it is joint. Files
         are then more than ten times larger.
+    take : callable, optional
+        Called with the cloud, or with parts of half a million points or more if all images have a pose. The result of
+        parts is a sample of their points, with the counts of all.
     progress : callable, optional
         Called after each image with the number of images done and the total number.
 
@@ -118,50 +132,61 @@ def reconstruct(
     if until is not None and index is not None:
         until, doubts = None, [*doubts, f"the verification does not apply: it had no `index` of {index:g}"]
 
-    def complete(cloud: PointCloud, **changes: Any) -> PointCloud:
-        metadata = changes.pop("metadata", cloud.metadata) | ({} if until is None else {VERIFIED: until})
-        warnings = [*doubts, *changes.pop("warnings", cloud.warnings)]
-        return replace(cloud, **changes, metadata=metadata, warnings=warnings)
-
     with open_capture(capture) as scan:
         check_fits(scan.header, calibration, source=scan.path.name)
         known = calibration.joint is not None if with_uncertainty is None else with_uncertainty
         alone = scan.header.T_platform_sensor is None and scan.pose_covariance is None
-        if alone and mount is None and trajectory is None and clock_offset_s is None and not clock_drift_ppm:
+        plain = alone and mount is None and trajectory is None and clock_offset_s is None and not clock_drift_ppm
+        if plain:
             _refuse_free_poses(scan)
-            stripes = find_stripes(scan, options=stripe, progress=progress)
-            return complete(reconstruct_stripes(scan, stripes, calibration, index=index, with_uncertainty=known))
         mount = read_mount(mount) if isinstance(mount, str | Path) else mount
         if isinstance(trajectory, str | Path):
             trajectory = read_trajectory(trajectory, pose_format=pose_format, unit=pose_unit)
-        ride = find_platform_poses(
-            scan, trajectory, mount=mount, clock_offset_s=clock_offset_s, clock_drift_ppm=clock_drift_ppm
-        )
-        stripes = find_stripes(scan, options=stripe, progress=progress)
-        table = add_platform_poses(scan, ride, mount)
-        independent, common = (
-            (None, None) if mount is None else mount.independent_covariance(calibration_digest(calibration))
-        )
-        if mount is not None and common is None:
-            # The mount of another calibration: its covariance contains the errors of the OCS.
-            common = np.zeros((6, 0))
-        cloud = reconstruct_stripes(
-            table, stripes, calibration, index=index, with_uncertainty=known, mount_by=common if known else None
-        )
-        warnings = [*ride.doubts, *cloud.warnings]
-        if mount is None and scan.header.T_platform_sensor is not None:
-            warnings = [*warnings, "the mount has its design values: calibrate it (uwlts mount) and give `mount`"]
-        stated = cloud.uncertainty
-        if stated is not None:
-            where = cloud.points_mm, cloud.frame, ride
-            stated = add_platform_uncertainty(
-                stated, *where, mount, mount_covariance=independent, correlation_s=pose_correlation_s
-            )
-        metadata = cloud.metadata | ({EDITED: "mount"} if mount is not None and mount.edited else {})
-        metadata |= {} if ride.margins_s is None else {"trajectory_margins_s": [*ride.margins_s]}
-        return complete(
-            cloud, uncertainty=stated, warnings=warnings, metadata=metadata, time_s=scan.time_s[cloud.frame]
-        )
+        clock = {"clock_offset_s": clock_offset_s, "clock_drift_ppm": clock_drift_ppm}
+        ride = None if plain else find_platform_poses(scan, trajectory, mount=mount, **clock)
+        table, independent, common = scan if ride is None else add_platform_poses(scan, ride, mount), None, None
+        if mount is not None:
+            independent, common = mount.independent_covariance(calibration_digest(calibration))
+            # The covariance of the mount of another calibration contains the errors of the OCS.
+            common = np.zeros((6, 0)) if common is None else common
+        chosen = ErrorPatterns()
+
+        def measure(stripes: CaptureStripes) -> PointCloud:
+            uncertain = {"with_uncertainty": known, "mount_by": common if known else None, "chosen": chosen}
+            cloud = reconstruct_stripes(table, stripes, calibration, index=index, **uncertain)
+            warnings, stated = cloud.warnings, cloud.uncertainty
+            metadata = cloud.metadata | ({} if until is None else {VERIFIED: until})
+            if ride is None:
+                return replace(cloud, warnings=[*doubts, *warnings], metadata=metadata)
+            if mount is None and scan.header.T_platform_sensor is not None:
+                warnings = [*warnings, "the mount has its design values: calibrate it (uwlts mount) and give `mount`"]
+            if stated is not None:
+                both = {"mount_covariance": independent, "correlation_s": pose_correlation_s, "chosen": chosen}
+                stated = add_platform_uncertainty(stated, cloud.points_mm, cloud.frame, ride, mount, **both)
+            metadata |= {EDITED: "mount"} if mount is not None and mount.edited else {}
+            metadata |= {} if ride.margins_s is None else {"trajectory_margins_s": [*ride.margins_s]}
+            new = {"uncertainty": stated, "metadata": metadata, "time_s": scan.time_s[cloud.frame]}
+            return replace(cloud, warnings=[*doubts, *ride.doubts, *warnings], **new)
+
+        images, most = np.flatnonzero(scan.laser_on), math.inf
+        large = len(images) * scan.header.sensor.camera.lines() >= 2 * _PART
+        if take is not None and large and np.isfinite(table.pose[images]).all():
+            most, some = _PART, copy(scan)
+            # Parts of a cloud share their error patterns, which are those of the whole scan.
+            some.laser_on = np.isin(np.arange(len(scan)), images[:: max(1, len(images) // _SAMPLED_IMAGES)])
+            with suppress(CaptureError, CalibrationError):  # too few stripes in these: the first part determines them
+                measure(find_stripes(some, options=stripe))
+        kept, lines, rays = list[PointCloud](), Counter[str](), Counter[str]()
+        for stripes in find_stripes_in_parts(scan, most, options=stripe, progress=progress):
+            part = measure(stripes)
+            if take is not None:
+                take(part)
+            lines.update(part.lines_by_status)
+            rays.update(part.rays_by_status)
+            few = part.frame % max(1, len(images) // _KEPT_IMAGES) + part.line % _SAMPLED_LINES == 0
+            kept.append(part if most == math.inf else part.select(np.flatnonzero(few)))
+        whole = kept[0] if len(kept) == 1 else concatenate_clouds(kept)
+        return replace(whole, lines_by_status=dict(lines), rays_by_status=dict(rays))
 
 
 def _refuse_free_poses(scan: Capture) -> None:
@@ -183,6 +208,7 @@ def reconstruct_stripes(
     index: float | None = None,
     with_uncertainty: bool = False,
     mount_by: np.ndarray | None = None,
+    chosen: ErrorPatterns | None = None,
 ) -> PointCloud:
     """Triangulate the stripes of a capture to a point cloud.
 
@@ -195,7 +221,7 @@ def reconstruct_stripes(
     blur than by noise, counted as ``blurred``.
 
     ``index`` is the refractive index, by default that of the capture's medium. The uncertainty of the points needs a
-    joint calibration; ``mount_by`` as for `point_uncertainty`.
+    joint calibration; ``mount_by`` and ``chosen`` as for `point_uncertainty`.
 
     Raises CalibrationError if the calibration does not fit the capture, or an index is given for a polynomial one;
     RangeError if the index is outside the range of media.
@@ -240,7 +266,7 @@ def reconstruct_stripes(
         if exact is None:
             raise CalibrationError("the calibration states no uncertainty: calibrate jointly (`water` or `joint`)")
         centres = kept.frame, kept.line, kept.centre_px
-        moved = {"blur_px": blur[good], "beside_mm": beside[good], "mount_by": mount_by}
+        moved = {"blur_px": blur[good], "beside_mm": beside[good], "mount_by": mount_by, "chosen": chosen}
         known = point_uncertainty(capture, exact, centres, **moved, digest=digest)
     rays = np.bincount(found.status, minlength=len(RayStatus))
     return PointCloud(

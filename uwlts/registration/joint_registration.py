@@ -124,7 +124,7 @@ class JointRegistration:
         # Rotations are scaled by the scan's rms radius, so that all pose unknowns are lengths.
         turns = np.repeat(np.array([[1.0, 1 / size] for size in self.sizes[1:]]).ravel(), 3)
         self.units = np.append(turns, np.ones(ends[-1] - ends[0]))
-        self.prior_information = _prior_information(self.patterns, shared or [{}] * len(patches))
+        self.prior_information = _compute_prior_information(self.patterns, shared or [{}] * len(patches))
 
     @property
     def unknown_poses(self) -> int:
@@ -429,7 +429,7 @@ def _count_patches(found: dict[tuple[int, int], PatchDistances], a: int, b: int)
     return sum(len(distances.source) for *_, distances in _distances_both_ways(found, a, b))
 
 
-def _prior_information(patterns: Sequence[np.ndarray], shared: Sequence[dict[str, np.ndarray]]) -> np.ndarray:
+def _compute_prior_information(patterns: Sequence[np.ndarray], shared: Sequence[dict[str, np.ndarray]]) -> np.ndarray:
     """Return the prior information (U, U) on the pattern amplitudes of all scans, each of unit variance."""
     ends = np.cumsum([0, *map(len, patterns)])
     covariance = (1 + _OWN_PART) * np.eye(ends[-1])

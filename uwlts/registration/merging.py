@@ -21,28 +21,29 @@ def merge_clouds(
     ``covariance`` (U, U) is that of all unknowns of the estimate. A scan without uncertainty receives that of its pose
     alone.
     """
-    rows, firsts, first = [], [], 0
+    ends = np.cumsum([len(scan) for scan in scans])
+    firsts = np.cumsum([0, *(1 + int(scan.frame.max(initial=-1)) for scan in scans[:-1])]).tolist()
+    frames = [
+        np.where(scan.frame == NO_INDEX, NO_INDEX, scan.frame + at) for scan, at in zip(scans, firsts, strict=True)
+    ]
+    points, random = np.empty((ends[-1], 3)), np.zeros((ends[-1], 6), np.float32)
+    position = np.zeros((ends[-1], 3), np.float32)
     for number, scan in enumerate(scans):
-        rotation, known = joint.poses[number, :3, :3], scan.uncertainty
-        places, random, position = scan.points_mm, np.zeros((len(scan), 6)), np.zeros((len(scan), 3))
+        here, rotation = slice(ends[number] - len(scan), ends[number]), joint.poses[number, :3, :3]
+        places, known = scan.points_mm, scan.uncertainty
         if known is not None:
             places = places + np.tensordot(joint.patterns[number], known.patterns_mm, axes=1)
-            random, position = rotate_covariances(known.random_mm2, rotation), known.position_mm @ rotation.T
-        frame = np.where(scan.frame == NO_INDEX, NO_INDEX, scan.frame + first)
-        moved = places @ rotation.T + joint.poses[number, :3, 3]
-        rows.append((moved, random, position, frame, scan.intensity, scan.line))
-        firsts.append(first)
-        first += int(scan.frame.max(initial=-1)) + 1
-    points, random, position, frame, intensity, line = (np.concatenate(each) for each in zip(*rows, strict=True))
-    patterns = _joint_patterns(scans, [moved for moved, *_ in rows], joint, covariance)
-    parts = random.astype(np.float32), position.astype(np.float32), patterns, _rotate_image_poses(scans, joint)
+            random[here] = rotate_covariances(known.random_mm2, rotation)
+            position[here] = known.position_mm @ rotation.T
+        points[here] = places @ rotation.T + joint.poses[number, :3, 3]
+    patterns = _joint_patterns(scans, np.split(points, ends[:-1]), joint, covariance)
     times = [scan.time_s for scan in scans if scan.time_s is not None]
     return PointCloud(
         points_mm=points,
-        intensity=intensity,
-        frame=frame,
-        line=line,
-        uncertainty=PointUncertainty(*parts),
+        intensity=np.concatenate([scan.intensity for scan in scans]),
+        frame=np.concatenate(frames),
+        line=np.concatenate([scan.line for scan in scans]),
+        uncertainty=PointUncertainty(random, position, patterns, _rotate_image_poses(scans, joint)),
         time_s=np.concatenate(times) if len(times) == len(scans) else None,
         metadata=_merge_metadata(scans, names, joint, firsts),
     )
@@ -93,10 +94,11 @@ def _joint_patterns(
     strengths, ways = np.maximum(strengths[::-1], 0.0), ways[:, ::-1]
     left = 1 - np.cumsum(strengths) / max(strengths.sum(), 1e-300)
     count = 1 + int(np.argmax(left <= _LEFT_OUT))
-    parts = [
-        np.tensordot(ways[:, :count].T, shifts(number, here), axes=1).astype(np.float32) for number, here in blocks()
-    ]
-    return np.concatenate(parts, axis=1)
+    result = np.empty((count, sum(map(len, points)), 3), np.float32)
+    of_scans = np.split(result, np.cumsum([len(each) for each in points])[:-1], axis=1)
+    for number, here in blocks():
+        of_scans[number][:, here] = np.tensordot(ways[:, :count].T, shifts(number, here), axes=1)
+    return result
 
 
 def _merge_metadata(

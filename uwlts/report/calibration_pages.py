@@ -61,7 +61,12 @@ def write_camera(path: str | Path, camera: CameraCalibration, *, overwrite: bool
         for each in camera.photographs
     ]
     models = [
-        [each.name, str(each.parameters()), f"{each.rms_px:.4f}", "taken" if each.options == lens.options else ""]
+        [
+            each.options.name,
+            str(each.parameters()),
+            f"{each.rms_px:.4f}",
+            "taken" if each.options == lens.options else "",
+        ]
         for each in lens.candidates
     ]
     text = render_page(
@@ -83,7 +88,7 @@ def camera_lines(camera: CameraCalibration) -> list[str]:
     """Return the result as lines of text."""
     taken = camera.lens.options
     models = [
-        f"  {each.name:32} {each.rms_px:8.4f} px" + ("   taken" if each.options == taken else "")
+        f"  {each.options.name:32} {each.rms_px:8.4f} px" + ("   taken" if each.options == taken else "")
         for each in camera.lens.candidates
     ]
     return _summary(camera) + (

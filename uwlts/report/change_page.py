@@ -227,8 +227,7 @@ def _overlaps(registered: RegisteredScans) -> str:
     places = np.vstack([each.places_mm for each in registered.overlaps])
     distance = np.concatenate([each.distance_mm for each in registered.overlaps])
     limit = surface_limit_mm(distance)
-    every = slice(None, None, max(1, len(registered.cloud) // _SHOWN))
-    beneath = registered.cloud.points_mm[every]
+    beneath = registered.cloud.points_mm[slice(None, None, max(1, len(registered.cloud) // _SHOWN))]
 
     def draw(axes: Any, first: int, second: int) -> Any:
         axes.plot(beneath[:, first], beneath[:, second], ",", color="#d5d5d5", rasterized=True)

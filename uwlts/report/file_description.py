@@ -134,13 +134,7 @@ _DESCRIPTIONS = (
 """Kinds of descriptions, keys by which they are recognised in this order, and the command that uses them."""
 
 
-def describe(
-    path: str | Path,
-    *,
-    unit: Unit | None = None,
-    schema: str | Path | None = None,
-    pose_format: PoseFormat = SAVED_FORMAT,
-) -> str:
+def describe(path: str | Path, *, unit: Unit | None = None, pose_format: PoseFormat = SAVED_FORMAT) -> str:
     """Describe a file that `read` reads, a digital calibration certificate, a sensor (by name or path), or a plan.
 
     Parameters
@@ -149,9 +143,6 @@ def describe(
         File, or name of a shipped sensor such as thesis.
     unit : {"mm", "m"}, optional
         As for `export`.
-    schema : str or Path, optional
-        XML schema (dcc.xsd) by which a digital calibration certificate is validated. Schemas that it imports are beside
-        it.
     pose_format : str
         Format of a trajectory, such as euler-ZYX-deg, tum or ros, as for `reconstruct`.
 
@@ -163,16 +154,14 @@ def describe(
     Raises
     ------
     CaptureError, DescriptionError
-        The file is missing, damaged, or of another kind, or not valid by the schema.
-    SetupError
-        The library for schemas is not installed.
+        The file is missing, damaged, or of another kind.
     """
     name, path = str(path), Path(path)
     endings = [each for each in path.suffixes if each != ".part"]
     if (not endings and not path.is_dir()) or endings[-1:] == [".toml"]:
         lines = _name_description(path) or sensor_lines(load_sensor(name))
     elif endings[-1:] == [".xml"]:
-        lines = digital_certificate_lines(path, schema)
+        lines = digital_certificate_lines(path)
     elif endings[-2:] == [".truth", ".h5"] or (endings[-1:] == [".h5"] and read_format(path) == TRUTH):
         lines = truth_lines(*read_truth(path))
     else:

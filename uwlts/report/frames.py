@@ -60,15 +60,15 @@ def to_frame(result: object) -> DataFrame:
         case PointCloud():
             table = _point_columns(result)
         case Evaluation():
-            table = [_row(each) for each in result.figures]
+            table = [_make_row(each) for each in result.figures]
         case Inspection():
             table = [
-                {f"feature_{name}": value for name, value in _row(feature).items()} | _row(each)
+                {f"feature_{name}": value for name, value in _make_row(feature).items()} | _make_row(each)
                 for feature in result.features
                 for each in feature.values
             ]
         case Calibration():
-            table = [_row(each) for each in parameter_rows(result)]
+            table = [_make_row(each) for each in parameter_rows(result)]
             if result.joint is None:
                 text, std = "direction of the sheet's normal", result.std().sheet_normal_deg
                 table.append({"name": "sheet_normal", "words": text, "unit": "°", "std": std})
@@ -77,7 +77,7 @@ def to_frame(result: object) -> DataFrame:
         case Mapping():
             table = result
         case Sequence() if all(_field_names(type(each)) for each in result):
-            table = [_row(each) for each in result]
+            table = [_make_row(each) for each in result]
         case _:
             raise ArgumentError(
                 f"`result` is of the type {type(result).__name__}, which has no table; expected Evaluation, "
@@ -102,7 +102,7 @@ def _point_columns(cloud: PointCloud) -> dict[str, np.ndarray]:
     return {name: values for name, values in columns.items() if values is not None}
 
 
-def _row(record: object) -> dict[str, Any]:
+def _make_row(record: object) -> dict[str, Any]:
     """Return the columns of a record: its fields, then its properties that are plain values."""
     row = _flatten(record, type(record))
     for name, member in vars(type(record)).items():

@@ -23,7 +23,6 @@ EXTRAS = {
     "frames": "results as tables of pandas",
     "registration": "the search for initial poses by shape",
     "ros": "ROS bags, and clouds as MCAP",
-    "schema": "validation of digital certificates",
 }
 """Features that need optional libraries, by the extra of this project that lists them."""
 

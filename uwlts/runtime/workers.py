@@ -44,6 +44,7 @@ _LEAVE_S = 5.0  # further time, for a busy machine, before the process is killed
 
 _WAIT_S = 0.2  # interval at which the caller may end jobs
 
+_PATIENCE_S = 20.0  # time limit of a scheduler's answer
 _AHEAD = 2
 """Jobs submitted to a cluster per worker: one running and one queued, so that no worker waits for this process."""
 
@@ -79,18 +80,16 @@ class Workers(ABC):
 
 
 @contextmanager
-def open_workers(
-    *, workers: int | None = None, scheduler: str | None = None, patience_s: float = 20.0
-) -> Iterator[Workers]:
+def open_workers(*, workers: int | None = None, scheduler: str | None = None) -> Iterator[Workers]:
     """Open ``workers`` processes on this machine (default: one per processor), or the workers of a Dask scheduler.
 
-    ``patience_s`` is the time limit of the scheduler's answer. Processes share the machine's threads. If an exception
+    Processes share the machine's threads. If an exception
     leaves the body, running jobs are stopped by KeyboardInterrupt; no process is left.
 
     Raises SetupError if Dask is not installed, no scheduler answers at the address, or it has no workers.
     """
     if scheduler is not None:
-        with _cluster(scheduler, patience_s) as cluster:
+        with _cluster(scheduler) as cluster:
             yield cluster
         return
     count = workers or count_processors()
@@ -412,7 +411,7 @@ class _Cluster(Workers):
 
 
 @contextmanager
-def _cluster(address: str, patience_s: float) -> Iterator[_Cluster]:
+def _cluster(address: str) -> Iterator[_Cluster]:
     try:
         from distributed import Client
         from distributed.scheduler import KilledWorker
@@ -420,7 +419,7 @@ def _cluster(address: str, patience_s: float) -> Iterator[_Cluster]:
         needed = pip_install(read_requirements()[2]["cluster"])
         raise SetupError(f"a scheduler needs the library distributed, which is not installed: {needed}") from error
     try:
-        client: Any = Client(address, timeout=patience_s, set_as_default=False)
+        client: Any = Client(address, timeout=_PATIENCE_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise SetupError(f"no Dask scheduler answers at {address}: {error}") from error
     with client:

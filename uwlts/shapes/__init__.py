@@ -1,1 +1,1 @@
-"""Shapes that are measured: each is one class that finds, fits and differentiates itself."""
+"""Shapes that are measured: one class each, to find and fit the shape and to propagate errors."""

@@ -51,8 +51,7 @@ class Cylinder:
         """Return the derivatives (M, 5) or (M, 4) of the distances by the parameters, ordered as the covariance."""
         offsets = -self.normals_at(points) @ self.across.T
         along = ((points - self.point_mm) @ self.axis)[:, None]
-        by_radius = np.full((len(points), len(self.covariance) - 4), -1.0)
-        return np.hstack([offsets, along * offsets, by_radius])
+        return np.hstack([offsets, along * offsets, np.full((len(points), len(self.covariance) - 4), -1.0)])
 
     @classmethod
     def fit(cls, points: Any, radius_mm: float | None = None, axis_start: Any = None) -> Self:

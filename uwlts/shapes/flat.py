@@ -193,8 +193,7 @@ def fit_algebraic_centres(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     curvature = vector[..., 0] / half
     curvature = np.where(np.abs(curvature) < 1e-9, np.copysign(1e-9, curvature), curvature)
     centres = -vector[..., 1:] / (2.0 * curvature[..., None])
-    radii = np.sqrt(np.sum(centres**2, axis=-1) + mean)
-    return centres, radii
+    return centres, np.sqrt(np.sum(centres**2, axis=-1) + mean)
 
 
 def initial_centre(points: np.ndarray, radius: float) -> np.ndarray:
@@ -205,8 +204,7 @@ def initial_centre(points: np.ndarray, radius: float) -> np.ndarray:
     centre, _ = fit_algebraic_centres(points)
     direction = centre / max(float(np.linalg.norm(centre)), 1e-12)
     across = np.sum(points**2, axis=-1) - (points @ direction) ** 2
-    depth = np.sqrt(max(radius**2 - float(across.mean()), (0.1 * radius) ** 2))
-    return direction * depth
+    return direction * np.sqrt(max(radius**2 - float(across.mean()), (0.1 * radius) ** 2))
 
 
 def prepare_round(points: Any, radius_mm: float | None, *, least: int, what: str) -> tuple[Normalised, float | None]:

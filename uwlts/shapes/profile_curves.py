@@ -49,8 +49,7 @@ class Detection:
     def without_isolated(self, points: np.ndarray) -> Self:
         """Return the detection without points of the profile (N, 2) that have few others beside them."""
         count = len(points)
-        rows = np.flatnonzero(self.members)
-        spacing = float(np.median(np.linalg.norm(np.diff(points[rows], axis=0), axis=1)))
+        spacing = float(np.median(np.linalg.norm(np.diff(points[np.flatnonzero(self.members)], axis=0), axis=1)))
         beside, there = np.zeros(count), np.zeros(count)
         for lag in range(1, min(_NEIGHBOURS, count - 1) + 1):
             near = np.linalg.norm(points[lag:] - points[:-lag], axis=1) < _LARGEST_GAP * spacing * lag
@@ -187,8 +186,7 @@ def _refine_arc(points: np.ndarray, members: np.ndarray, tolerance: float) -> Pr
 
 def _arc_angle(offsets: np.ndarray) -> float:
     angles = np.sort(np.arctan2(offsets[:, 1], offsets[:, 0]))
-    gaps = np.diff(angles, append=angles[0] + 2 * np.pi)
-    return float(2 * np.pi - gaps.max())
+    return float(2 * np.pi - np.diff(angles, append=angles[0] + 2 * np.pi).max())
 
 
 def find_line(points: np.ndarray, rng: np.random.Generator) -> ProfileLine | None:

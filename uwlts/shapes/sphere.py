@@ -181,8 +181,7 @@ def _refine_centre(points: np.ndarray, centre: np.ndarray, radius: float) -> np.
         near = np.abs(distance - radius) < _SEARCH_LIMIT * radius
         if np.count_nonzero(near) < 4:
             return centre
-        unit = offset[near] / distance[near, None]
-        step, *_ = np.linalg.lstsq(unit, distance[near] - radius, rcond=1e-3)
+        step, *_ = np.linalg.lstsq(offset[near] / distance[near, None], distance[near] - radius, rcond=1e-3)
         centre = centre + step
     return centre
 
@@ -229,6 +228,5 @@ def _mark_crossed(offsets: np.ndarray, distances: np.ndarray, limit: float, usab
     direction = offsets[near] / np.linalg.norm(offsets[near], axis=1, keepdims=True)
     _, cell = np.unique(number_cubes(direction + 1.0, _CELL), return_inverse=True)
     outer = np.bincount(cell, weights=np.abs(distances[near]) > limit)
-    total = np.bincount(cell)
-    crossed[near] = ((outer >= _OUTER_COUNT) & (outer > _OUTER_SHARE * total))[cell]
+    crossed[near] = ((outer >= _OUTER_COUNT) & (outer > _OUTER_SHARE * np.bincount(cell)))[cell]
     return crossed

@@ -30,45 +30,25 @@ from uwlts.storage.capture import (
     part_path,
     require_covariances,
 )
-from uwlts.storage.hdf5_file import forget_plan, write_label, write_plan
+from uwlts.storage.hdf5_file import claim_space, forget_plan, truncate, write_label, write_plan
 
 try:
     import fcntl
 except ImportError:
     fcntl = None
 
-# Space for HDF5's metadata of an added frame: its index and the chunks of the other datasets.
-_MARGIN_BYTES = 2**18
-
 
 class CaptureWriter(AbstractContextManager["CaptureWriter"]):
     """Recording of a capture, as a context manager: a normal exit finishes the file, an exception keeps the part.
 
-    Parameters
-    ----------
-    path : str or Path
-        The capture.
-    header : CaptureHeader
-        Metadata common to all frames.
-    dtype : dtype
-        Type of the images, uint8 or uint16.
-    centre_lines : bool
-        Laser frames are centre lines.
-    moving : bool
-        Frames have a speed, and `place` adds the stage's reports.
-    plan : dict, optional
-        Further description of the recording as JSON, kept in the part but not in the finished capture.
-    covariances : bool
-        Frames may have a covariance of their pose.
-    overwrite, resume : bool
-        Replace an existing capture or part; continue a part.
+    ``header`` describes all frames, ``dtype`` is that of their images, uint8 or uint16. With ``centre_lines``, laser
+    frames are centre lines. With ``moving``, frames have a speed, and `place` adds the stage's reports. With
+    ``covariances``, they may have a covariance of their pose. ``plan`` describes the recording as JSON, and is kept in
+    the part but not in the finished capture. ``overwrite`` replaces an existing capture or part, ``resume`` continues
+    a part.
 
-    Raises
-    ------
-    OutputError
-        The file exists or is an input of the running command, a part exists, or writing fails.
-    CaptureError
-        The part to resume is damaged, or has another header or plan.
+    OutputError if the file exists or is an input of the running command, a part exists, or writing fails; CaptureError
+    if the part to resume is damaged, or has another header or plan.
     """
 
     def __init__(
@@ -89,6 +69,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         self._part = part_path(self.path)
         camera = header.sensor.camera
         self._shape, self._dtype = (camera.height_px, camera.width_px), np.dtype(dtype)
+        self._frame_bytes = camera.height_px * camera.width_px * self._dtype.itemsize
         self._lines, self._moving = camera.lines() if centre_lines else 0, moving
         self._columns: dict[str, tuple[tuple[int, ...], type]] = {COVARIANCE: ((6, 6), float)} if covariances else {}
         self._version = VERSION if self._lines or moving else 1
@@ -140,7 +121,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         fresh = self._part.with_suffix(".fresh")
         try:
             with h5py.File(fresh, "w", libver="latest", locking=False) as self._file:
-                self._claim_space()
+                claim_space(self._file, self._frame_bytes)
                 write_label(self._file, file_format=FORMAT, version=self._version, header=self.header)
                 if self._plan is not None:
                     write_plan(self._file, self._plan)
@@ -168,7 +149,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
                 self._arrays = _arrays(self._file)
                 for frame in unfinished:
                     self._store(frame)
-            _truncate(fresh)
+            truncate(fresh)
             os.replace(fresh, self._part)
         finally:
             fresh.unlink(missing_ok=True)
@@ -203,7 +184,10 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             raise CaptureError(
                 f"a frame at {frame.time_s} s cannot follow one at {self._last_s} s: give increasing times"
             )
-        _require_pose(frame.pose)
+        if frame.pose is not None and (np.shape(frame.pose) != (4, 4) or not np.isfinite(frame.pose).all()):
+            raise CaptureError(f"a pose must be a finite array (4, 4); found {frame.pose}")
+        if frame.pose is not None and not is_rigid(frame.pose, within=POSE_ROUNDED):
+            raise CaptureError(f"a pose must be a rotation, a shift and 0 0 0 1; found {frame.pose.tolist()}")
         if frame.pose_covariance is not None:
             if COVARIANCE not in self._columns:
                 raise CaptureError("the capture was begun without covariances of poses: begin it with covariances=True")
@@ -236,7 +220,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             raise ImageError("frame is an image with the laser on, the capture holds centre lines for these")
 
     def _store(self, frame: Frame) -> None:
-        self._claim_space()
+        claim_space(self._file, self._frame_bytes)
         line = stack_rows(frame.seen) if isinstance(frame.seen, Stripe) else None
         # Chunks of a dataset that are not written take no space.
         values: dict[str, Any] = {"frames": frame.seen if line is None else None} | (
@@ -255,18 +239,6 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
                 dataset[count] = value
             dataset.flush()
         self._last_s = frame.time_s
-
-    def _claim_space(self) -> None:
-        """Extend the file by zeros to hold one more frame; raises OSError if the disk is full.
-
-        HDF5 does not survive a full disk: closing the file fails and the process may crash.
-        """
-        frame_bytes = self._shape[0] * self._shape[1] * self._dtype.itemsize
-        wanted = self._file.id.get_filesize() + frame_bytes + _MARGIN_BYTES
-        with open(self._file.filename, "r+b", buffering=0) as file:
-            size = file.seek(0, os.SEEK_END)
-            while size < wanted:
-                size += file.write(bytes(wanted - size))
 
     @contextmanager
     def _storage(self) -> Iterator[None]:
@@ -288,15 +260,8 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             elif kind is None:
                 if self._plan is not None:
                     forget_plan(self._part)
-                _truncate(self._part)
+                truncate(self._part)
                 os.replace(self._part, self.path)
-
-
-def _require_pose(pose: np.ndarray | None) -> None:
-    if pose is not None and (np.shape(pose) != (4, 4) or not np.isfinite(pose).all()):
-        raise CaptureError(f"a pose must be a finite array (4, 4); found {pose}")
-    if pose is not None and not is_rigid(pose, within=POSE_ROUNDED):
-        raise CaptureError(f"a pose must be a rotation, a shift and 0 0 0 1; found {pose.tolist()}")
 
 
 def _lock(part: Path) -> BufferedReader:
@@ -311,11 +276,6 @@ def _lock(part: Path) -> BufferedReader:
     except OSError:
         pass  # a file system without locks
     return file
-
-
-def _truncate(path: Path) -> None:
-    """Cut off unused space, which HDF5 does when a file is opened and closed again."""
-    h5py.File(path, "r+", locking=False).close()
 
 
 def _recording_table(header: CaptureHeader, dtype: np.dtype, plan: Table | None, *, lines: bool, moving: bool) -> Table:

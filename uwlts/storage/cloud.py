@@ -110,11 +110,7 @@ class PointUncertainty:
 
     def covariance_mm2(self) -> np.ndarray:
         """Return the total covariance (N, 3, 3) of each point's coordinates."""
-        result = np.empty((len(self.random_mm2), 3, 3), self.random_mm2.dtype)
-        for start in range(0, len(result), _BLOCK):
-            some = self[start : start + _BLOCK]
-            result[start : start + _BLOCK] = expand_covariances(some.independent_mm2() + some.systematic_mm2())
-        return result
+        return expand_covariances(self.independent_mm2() + self.systematic_mm2())
 
     def std_mm(self) -> np.ndarray:
         """Return the total standard uncertainty (N, 3) of each coordinate."""
@@ -123,8 +119,9 @@ class PointUncertainty:
 
 def _pairs_of(parts_mm: np.ndarray) -> np.ndarray:
     """Return the covariances (N, 6) of points displaced by independent parts (M, N, 3); see `PAIRS`."""
-    axes = np.ascontiguousarray(parts_mm.transpose(2, 0, 1))
-    return np.stack([np.einsum("mn,mn->n", axes[i], axes[j]) for i, j in PAIRS], axis=1)
+    blocks = (parts_mm[:, start : start + _BLOCK] for start in range(0, max(1, parts_mm.shape[1]), _BLOCK))
+    axes = (np.ascontiguousarray(block.transpose(2, 0, 1)) for block in blocks)
+    return np.concatenate([np.stack([np.einsum("mn,mn->n", x[i], x[j]) for i, j in PAIRS], axis=1) for x in axes])
 
 
 def expand_covariances(pairs: np.ndarray) -> np.ndarray:
@@ -438,9 +435,8 @@ def omit_points(points_mm: np.ndarray, omitted: Mapping[str, np.ndarray]) -> tup
     finite, zero = np.isfinite(x) & np.isfinite(y) & np.isfinite(z), (x == 0) & (y == 0) & (z == 0)
     reasons = {"without finite coordinates": ~finite, **omitted}
     if (count := np.count_nonzero(zero)) > FEW_ZEROS:
-        others = points_mm[finite & ~zero]
         # Points in rounded coordinates may coincide anywhere.
-        repeated = np.unique(np.sort(others @ _MIXED), return_counts=True)[1].max(initial=1)
+        repeated = np.unique(np.sort(points_mm[finite & ~zero] @ _MIXED), return_counts=True)[1].max(initial=1)
         if count > FEW_ZEROS * repeated:
             reasons["at exactly 0 0 0"] = zero
     unwanted, warnings = np.zeros(len(points_mm), bool), []

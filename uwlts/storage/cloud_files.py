@@ -96,11 +96,8 @@ def write_cloud(
             form.write(aside, cloud, colours, path)
         return
     if _in_hdf5(path):
-        arrays, known = {name: getattr(cloud, name) for name in KINDS}, cloud.uncertainty
-        if known is not None:
-            arrays |= {name: getattr(known, name) for name in _UNCERTAINTY} | {"systematic_mm2": known.systematic_mm2()}
-        header = _CloudHeader(metadata=_add_shared(cloud))
-        write_arrays(path, arrays, file_format=FORMAT, version=VERSION, header=header, overwrite=overwrite)
+        with write_cloud_in_parts(path, overwrite=overwrite) as write:
+            write(cloud)
         return
     single = str(path).lower().endswith(SINGLE)
     if single and np.abs(cloud.points_mm).max(initial=0.0) > FARTHEST_SINGLE_MM:
@@ -121,6 +118,31 @@ def write_cloud(
         columns |= _uncertainty_columns(cloud.uncertainty)
     cloud = cloud if full else replace(cloud, uncertainty=None)
     write_ply_points(path, columns, comments=_comments(_add_shared(cloud)), overwrite=overwrite)
+
+
+@contextmanager
+def write_cloud_in_parts(
+    path: str | os.PathLike[str], *, overwrite: bool = False
+) -> Iterator[Callable[[PointCloud], None]]:
+    """Give the body a function that takes the parts of a cloud; see `write_cloud`.
+
+    HDF5 is written part by part. For other formats all parts are held in memory.
+    """
+    if not _in_hdf5(path):
+        parts: list[PointCloud] = []
+        yield parts.append
+        write_cloud(path, concatenate_clouds(parts) if len(parts) > 1 else parts[0], overwrite=overwrite)
+        return
+    with write_arrays(path, file_format=FORMAT, version=VERSION, overwrite=overwrite) as append:
+
+        def write(part: PointCloud) -> None:
+            arrays, known = {name: getattr(part, name) for name in KINDS}, part.uncertainty
+            if known is not None:
+                arrays |= {name: getattr(known, name) for name in _UNCERTAINTY}
+                arrays["systematic_mm2"] = known.systematic_mm2()
+            append(arrays, _CloudHeader(metadata=_add_shared(part)))
+
+        yield write
 
 
 PointCloud.writer = staticmethod(write_cloud)

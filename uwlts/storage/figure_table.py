@@ -9,17 +9,12 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import BaseModel
 
 from uwlts.files.json_files import read_model, write_model
 from uwlts.model.short_text import Brief, align_columns
-from uwlts.runtime.optional_library import optional_library
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 FORMAT = "uwlts-figures"
 VERSION = 1  # of the file format
@@ -125,14 +120,10 @@ class FigureTable(Brief, BaseModel, frozen=True):
 
     @property
     def columns(self) -> dict[str, list[str] | np.ndarray]:
-        """Columns by name; missing numbers are NaN. The error is the last one."""
+        """Columns by name, for `uwlts.report.to_frame`; missing numbers are NaN. The error is the last one."""
         names = (*MeasuredFigure.model_fields, "error_mm")
         cells = {name: [getattr(row, name) for row in self.rows] for name in names}
         return {name: np.array(value, float) if name.endswith("_mm") else value for name, value in cells.items()}
-
-    def to_frame(self) -> DataFrame:
-        """Return the table as one of pandas; SetupError if this optional library is not installed."""
-        return optional_library("pandas", needed_by="a table of results", extra="frames").DataFrame(self.columns)
 
     def select(
         self, *, campaign: str | None = None, scan: str | None = None, method: str | None = None, figure: str = ""

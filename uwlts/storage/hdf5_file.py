@@ -8,9 +8,8 @@ import ctypes
 import json
 import math
 import os
-from collections.abc import Mapping
-from contextlib import suppress
-from io import BytesIO
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import EllipsisType
 from typing import Any, TypeVar
@@ -22,7 +21,7 @@ from pydantic import JsonValue
 
 from uwlts.errors import CaptureError, Error
 from uwlts.files.reading import MOST_JSON_BYTES, is_regular_file, parse_json
-from uwlts.files.writing import write_file
+from uwlts.files.writing import write_atomically
 from uwlts.model.library import validate_description
 from uwlts.model.sensor import Description, Table
 
@@ -36,6 +35,8 @@ _FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FL
 
 _MOST_SHRINKING = 1100  # largest compression ratio that is accepted: deflate reaches 1032 (zlib.net/zlib_tech.html)
 
+_PACKED: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
+_MARGIN_BYTES = 2**18  # for HDF5's metadata of what is added: its index, and chunks of further datasets
 _LARGEST_CHUNK = 2**23
 """Largest chunk in bytes, which is read as a whole. HDF5 makes chunks of up to 1 MiB, the program smaller ones."""
 
@@ -47,26 +48,54 @@ def write_label(file: h5py.File, *, file_format: str, version: int, header: Desc
     file.attrs["header"] = np.bytes_(header.model_dump_json().encode())
 
 
+@contextmanager
 def write_arrays(
-    path: str | Path,
-    arrays: Mapping[str, np.ndarray | None],
-    *,
-    file_format: str,
-    version: int,
-    header: Description,
-    overwrite: bool,
-) -> None:
-    """Write a labelled file with compressed arrays, without those that are None, completely or not at all."""
-    # Written in memory first: HDF5 does not survive a full disk. Its latest format protects all metadata by checksums.
-    content = BytesIO()
-    with h5py.File(content, "w", libver="latest") as file:
-        write_label(file, file_format=file_format, version=version, header=header)
-        for name, data in arrays.items():
-            if data is not None:
-                file.create_dataset(
-                    name, data=data, compression="gzip", compression_opts=1, shuffle=True, fletcher32=True
-                )
-    write_file(path, content.getbuffer(), overwrite=overwrite)
+    path: str | os.PathLike[str], *, file_format: str, version: int, overwrite: bool
+) -> Iterator[Callable[[Mapping[str, np.ndarray | None], Description], None]]:
+    """Give the body a function that appends compressed arrays to a labelled file, written completely or not at all.
+
+    It takes arrays by name, None for those that are not written, and the header; the first header is stored. Arrays
+    grow along their first axis, those with three axes along the second.
+    """
+    # The latest format protects all metadata by checksums.
+    with write_atomically(path, overwrite=overwrite) as aside:
+        with h5py.File(aside, "w", libver="latest", locking=False) as file:
+            stored: dict[str, h5py.Dataset] = {}
+
+            def append(arrays: Mapping[str, np.ndarray | None], header: Description) -> None:
+                held = {name: data for name, data in arrays.items() if data is not None}
+                claim_space(file, sum(data.nbytes for data in held.values()))
+                if not file.attrs:
+                    write_label(file, file_format=file_format, version=version, header=header)
+                for name, data in held.items():
+                    axis = int(data.ndim == 3)
+                    if name not in stored:
+                        most = tuple(None if k == axis else size for k, size in enumerate(data.shape))
+                        stored[name] = file.create_dataset(name, data=data, maxshape=most, **_PACKED)
+                    else:
+                        first = stored[name].shape[axis]
+                        stored[name].resize(first + data.shape[axis], axis)
+                        stored[name][(slice(None),) * axis + (slice(first, None),)] = data
+
+            yield append
+        truncate(aside)
+
+
+def claim_space(file: h5py.File, size: int) -> None:
+    """Extend a file by zeros to hold ``size`` more bytes, and HDF5's metadata; raises OSError if the disk is full.
+
+    HDF5 does not survive a full disk: closing the file fails and the process may crash.
+    """
+    wanted = file.id.get_filesize() + size + _MARGIN_BYTES
+    with open(file.filename, "r+b", buffering=0) as claimed:
+        there = claimed.seek(0, os.SEEK_END)
+        while there < wanted:
+            there += claimed.write(bytes(min(wanted - there, _LARGEST_CHUNK)))
+
+
+def truncate(path: Path) -> None:
+    """Cut off unused space, which HDF5 does when a file is opened and closed again."""
+    h5py.File(path, "r+", locking=False).close()
 
 
 def read_label(

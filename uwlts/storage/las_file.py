@@ -26,7 +26,7 @@ _BOX_MARGIN = 1e-3  # distance of points outside the stated box that is allowed,
 _LONGEST_HEADER = 375  # bytes (LAS 1.4, table 3)
 _RECORD_BYTES = 54  # smallest size of a variable length record in bytes: its header (LAS 1.4, 2.5)
 _LONGEST_SYSTEM = 2**20  # bytes
-_WKT = re.compile(rb"(?:COMPD_CS|COMPOUNDCRS|PROJCS|PROJCRS|GEOGCS|GEOGCRS|LOCAL_CS)\[[^\0]*")
+_WKT = re.compile(rb"(?:COMPD_CS|COMPOUNDCRS|BOUNDCRS|PROJCS|PROJCRS|GEOGCS|GEOGCRS|LOCAL_CS|ENGCRS)\[[^\0]*")
 _COMPRESSED = 0x80  # bit of the point format
 _POINT_BYTES = {0: (20, 0), 1: (28, 0), 2: (26, 0), 3: (34, 0), 6: (30, 9), 7: (36, 10), 8: (38, 11)}
 """Bytes of a point (LAS 1.4, 2.6) and compressed layers of a chunk by point format; each extra byte is one more."""
@@ -75,7 +75,7 @@ class SystemUnits:
 def describe_units(wkt: str = "", keys: dict[int, int] | None = None) -> SystemUnits:
     """Return the units of a coordinate system; heights have that of x and y if they state none."""
     keys = keys or {}
-    plane, *heights = _VERTICAL.split(wkt)
+    plane, *heights = _VERTICAL.split(wkt.partition("TARGETCRS")[0])
     if (_ANGULAR.search(plane) and not _PLANE.search(plane)) or (not wkt and keys.get(_MODEL) == _DEGREES):
         return SystemUnits(None, "degrees")
     # The unit of a system follows those of what it is based on.
@@ -91,7 +91,7 @@ def describe_units(wkt: str = "", keys: dict[int, int] | None = None) -> SystemU
                 notes=(f"its coordinate system EPSG:{keys[_SYSTEM]} is taken as one in m: is it in feet?",)
             )
     if not stated:
-        return SystemUnits()
+        return SystemUnits(notes=("its coordinate system states no unit of length: read in m",) if wkt else ())
     (name, across), (high, height) = stated[0], stated[-1]
     if {across, height} == {1.0}:
         return SystemUnits(name=name)

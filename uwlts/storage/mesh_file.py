@@ -170,7 +170,7 @@ def _find_unit(path: Path, known: str | None) -> tuple[str, list[str]]:
     comments = [line for line in start.splitlines() if line.startswith("#")]
     # Programs write such entries into the first 80 bytes of STL.
     comments += re.split("[;,\0]", start[:80]) if path.suffix.lower() == ".stl" else []
-    return find_stated_unit([*comments, f"unit: {known}"])
+    return find_stated_unit([*comments, *([f"unit: {known}"] if known else [])])
 
 
 def _ply_triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:

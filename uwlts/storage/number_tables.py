@@ -37,7 +37,8 @@ _SAME_UNITS |= {"microns": "um", "micron": "um", "inches": "in", "inch": "in", "
 _UNITS = _LENGTHS | _ANGLES | _TIMES
 _DIRECTIONS = {"east": (1, 0, 0), "north": (0, 1, 0), "up": (0, 0, 1)}
 _DIRECTIONS |= {"west": (-1, 0, 0), "south": (0, -1, 0), "down": (0, 0, -1)}
-_HEIGHTS = {"height": "up", "altitude": "up", "elevation": "up", "depth": "down"}
+_HEIGHTS = {"height": "up", "altitude": "up", "alt": "up", "elevation": "up", "depth": "down"}
+_LETTERS = {name[0]: name for name in ("east", "north", "up", "down")}
 _UNITS_OF = (
     {"time_s": _TIMES}
     | dict.fromkeys(_DIRECTIONS, _LENGTHS)
@@ -45,8 +46,10 @@ _UNITS_OF = (
     | dict.fromkeys(ROTATION_NAMES[4:], _ANGLES)
 )
 """Units of the columns whose units are converted or checked."""
-_SAME_NAMES = {name: name for name in ROTATION_NAMES} | {"azimuth": "heading", "bearing": "heading"} | _HEIGHTS
+_SAME_NAMES = {name: name for name in (*ROTATION_NAMES, *_DIRECTIONS)} | _HEIGHTS
 _SAME_NAMES |= {f"{name}ing": name for name in ("east", "north", "west", "south")}
+_SAME_NAMES |= dict.fromkeys(("azimuth", "bearing", "course", "cog", "compass", "hdg", "hdt", "hdm"), "heading")
+_BEFORE_NAMES = re.compile(r"(?:p|pos|position|[xyz]|utm|local|true|mag|magnetic|compass|gyro)[._ ](.+)")
 _OF_NUMBERS = {"q0": "qw", "q1": "qx", "q2": "qy", "q3": "qz"}
 _TIME_NAMES = ("time", "t", "timestamp", "stamp", "time_s")
 _IN_BRACKETS = re.compile(r"(.*?)[\s_]*[\[(<](.*)[\])>]")
@@ -62,6 +65,7 @@ _ROTATION = re.compile(r"(?:.*[._ /])?(?:r|rot|rotation|rotvec)[._ ]?([xyz])")
 _DECIMAL_COMMA = re.compile(rb"[+-]?\d+(?:,\d+)?(?:[eE][+-]?\d+)?")
 _UNIT_IN_COMMENT = re.compile(
     r"\b(?:in|units?)\b[\s:=;,]*(?:the |are |is )?[\[(]?(m|cm|um|µm|in|inch(?:es)?|ft|feet|(?:centi)?met(?:re|er)s?)\b"
+    r"|^\W*(?:1 )?(?:length|file|model|scene|linear|system)?[\s_]*units?\s*[:=]"
 )
 _STATED_UNIT = re.compile(
     r"\W*(?:(?:length|file|model|scene|linear|system)[\s_]*)?units?[\s:=;,]+[\[(\"']*([a-zµμ]+)\W*"
@@ -159,16 +163,6 @@ def _split_lines(
     return comments, block, header, unit_row, lines
 
 
-def _find_names(
-    header: bytes | None, unit_row: bytes | None, comments: list[bytes], delimiter: bytes, count: int, path: Path
-) -> list[str]:
-    """Return the names of ``count`` columns in the line before them or in a comment, with their units."""
-    if header is None:
-        header = next((each for each in reversed(comments) if _names_columns(each, delimiter, count)), None)
-    cells = [] if header is None else _name_cells(header, delimiter, count)
-    return cells if unit_row is None else _add_units(cells, _name_cells(unit_row, delimiter, count), path)
-
-
 def read_number_table(path: Path, *, named: bool = True) -> NumberTable:
     """Read a table of numbers, separated by commas, semicolons, tabs or blanks.
 
@@ -186,7 +180,10 @@ def read_number_table(path: Path, *, named: bool = True) -> NumberTable:
     comments, block, header, unit_row, lines = _split_lines(content, path)
     delimiter, comma = _separators(lines[0])
     count = len(_split(lines[0], delimiter))
-    cells = _find_names(header, unit_row, comments, delimiter, count, path)
+    named_in = header or next((each for each in reversed(comments) if _names_columns(each, delimiter, count)), None)
+    cells = _name_cells(named_in, delimiter, count) if named_in else []
+    if unit_row is not None:
+        cells = _add_units(cells, _name_cells(unit_row, delimiter, count), path)
     body = b"\n".join(lines) + b"\n"
     if delimiter == b" " and b"  " in body:
         body = re.sub(rb" {2,}", b" ", body)
@@ -253,11 +250,12 @@ def _names_and_units(cells: list[str], path: Path) -> tuple[list[str], dict[str,
         names = [_OF_NUMBERS.get(name, name) for name in names]
     if "qw" in names:
         names = [f"q{name[1]}" if name in ("rx", "ry", "rz") else name for name in names]
-    return names, units
+    full = _spell_directions(names)
+    return full, {new: units[old] for old, new in zip(names, full, strict=True) if old in units}
 
 
 def _name_axes(names: list[str], path: Path) -> tuple[list[str], tuple[str, ...]]:
-    """Return names with x, y and z in place of three directions, and these; raises DescriptionError if they mirror."""
+    """Return names with x, y and z for three directions, and these; DescriptionError for a left-handed frame."""
     found = tuple(name for name in names if name in _DIRECTIONS)
     if len(found) != 3 or not np.linalg.det([_DIRECTIONS[name] for name in found]):
         return names, ()
@@ -267,6 +265,11 @@ def _name_axes(names: list[str], path: Path) -> tuple[list[str], tuple[str, ...]
             "two, or change the sign of the last"
         )
     return [dict(zip(found, "xyz", strict=True)).get(name, name) for name in names], found
+
+
+def _spell_directions(names: list[str]) -> list[str]:
+    """Return names with three directions that are letters, such as n, e and d, in full."""
+    return [_LETTERS.get(name, name) for name in names] if len(_LETTERS.keys() & names) == 3 else names
 
 
 def _is_unit_row(line: bytes) -> bool:
@@ -385,7 +388,7 @@ def _text(line: bytes) -> str:
 def _names_columns(line: bytes, delimiter: bytes, count: int) -> bool:
     """Return whether a comment names columns: x and z, or an angle."""
     cells = _name_cells(line, delimiter, count)
-    names = {_split_unit(cell)[0] for cell in cells}
+    names = {*_spell_directions([_split_unit(cell)[0] for cell in cells])}
     known = {"x", "z"} <= names or "angle" in names or len(names & _DIRECTIONS.keys()) == 3
     return len(cells) == count and known
 
@@ -398,7 +401,7 @@ def _split_unit(cell: str) -> tuple[str, str | None]:
         text, unit = match[1], _plain_unit(match[2]) or None
     elif match := _AT_END.fullmatch(text):
         stem, last = match[1] or match[3], _plain_unit(match[2] or match[4])
-        if last in _UNITS and _normalise_name(stem) in _UNITS_OF:
+        if last in _UNITS and _normalise_name(stem) in _UNITS_OF.keys() | _LETTERS:
             text, unit = stem, last
     return _normalise_name(text.strip()), unit
 
@@ -411,8 +414,9 @@ def _plain_unit(unit: str) -> str:
 def _normalise_name(name: str) -> str:
     if name in _TIME_NAMES:
         return "time_s"
-    if name in _SAME_NAMES:
-        return _SAME_NAMES[name]
+    after = match[1] if (match := _BEFORE_NAMES.fullmatch(name)) else name
+    if same := _SAME_NAMES.get(after, after if after in _LETTERS else ""):
+        return same
     if match := _QUATERNION.fullmatch(name):
         return f"q{match[1] or match[2]}"
     if match := _POSITION.fullmatch(name):

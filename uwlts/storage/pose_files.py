@@ -32,9 +32,10 @@ _FORMAT = re.compile(
 _COLUMNS = {"matrix": (12, 16), "quaternion": (7,), "rotvec": (6,), "euler": (6,), "angle": (1,)}
 """Numbers of columns of a pose, by the first word of the format."""
 _FORMATS = "matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-zyx-deg (fixed axes), euler-ZYX-deg"
+_LAGS = (2, 3, 4)  # two sources in turn, or one with two or three times the rate; slower patterns may be waves
 _FEWEST_POSES, _ALTERNATING, _RETURNED, _LEAST_JUMP_MM, _REACH_MM = 10, 0.2, 0.3, 0.1, 300.0
 """Two sources: least number of poses, share that jumps, largest distance after it relative to the jump, smallest jump,
-and lever of rotations. Of independent noise along one axis, 14 % jump, in a plane 6 %."""
+and lever of rotations. Of independent noise along one axis, 17 % jump, in a plane 9 %."""
 _NEAR_HALF_TURN = 3.0
 """Angles in rad reach pi, unless turns are small; the largest in deg is between 3 and pi by chance only."""
 _METRES = np.array([1e3] * 3 + [1.0] * 3)
@@ -171,10 +172,13 @@ def _find_alternation(poses: np.ndarray) -> list[str]:
     steps, double_steps = (np.linalg.norm(places[lag:] - places[:-lag], axis=1) for lag in (1, 2))
     shorter = np.minimum(steps[:-1], steps[1:])
     jumps = (double_steps < _RETURNED * shorter) & (shorter > _LEAST_JUMP_MM)
-    # Every second pose lies on a smooth path of its own, also if the offset is along the path.
-    bent = np.linalg.norm(np.diff(places, 2, axis=0), axis=1)[1:-1]
-    smooth = np.linalg.norm(places[4:] - 2 * places[2:-2] + places[:-4], axis=1)
-    jumps[1:-1] |= (smooth < _RETURNED * bent) & (bent > 2 * _LEAST_JUMP_MM)
+    # Every second, third or fourth pose lies on a smooth path of its own, also if the offset is along the path.
+    bent = np.linalg.norm(np.diff(places, 2, axis=0), axis=1)
+    every = [jumps.copy() for _ in _LAGS]
+    for lag, found in zip(_LAGS, every, strict=True):
+        smooth = np.linalg.norm(places[2 * lag :] - 2 * places[lag:-lag] + places[: -2 * lag], axis=1)
+        found[lag - 1 : 1 - lag] |= smooth < _RETURNED * np.where(bent > 2 * _LEAST_JUMP_MM, bent, 0)[lag - 1 : 1 - lag]
+    jumps = max(every, key=np.mean)
     if np.mean(jumps) < _ALTERNATING:
         return []
     changes = (np.linalg.norm(np.diff(poses[:, :3, column], axis=0), axis=1)[:-1][jumps] for column in (0, 3))

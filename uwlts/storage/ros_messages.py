@@ -107,8 +107,7 @@ def unpack_points(message: Any) -> np.ndarray:
         "itemsize": message.point_step,
     }
     rows = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.row_step)
-    packed = np.ascontiguousarray(rows[:, : message.width * message.point_step])
-    return packed.view(np.dtype(layout)).ravel()
+    return np.ascontiguousarray(rows[:, : message.width * message.point_step]).view(np.dtype(layout)).ravel()
 
 
 TOPIC = "/points"
@@ -217,21 +216,12 @@ def read_bag_poses(path: Path, wanted: str = "") -> tuple[np.ndarray, np.ndarray
 
     Also returns covariances (N, 6, 6) in m and rad about fixed axes if every message states one, else None.
 
-    Parameters
-    ----------
-    path : Path
-        The bag.
-    wanted : str
-        Topic of messages Odometry, PoseStamped, PoseWithCovarianceStamped or TransformStamped; or ``PARENT>CHILD`` for
-        the transforms of frame CHILD in frame PARENT among all messages of type TFMessage. Optional if the bag has one
-        such topic, or none and the transforms of one pair of frames.
+    ``wanted`` is the topic of messages Odometry, PoseStamped, PoseWithCovarianceStamped or TransformStamped; or
+    ``PARENT>CHILD`` for the transforms of frame CHILD in frame PARENT among all messages of type TFMessage. Optional if
+    the bag has one such topic, or none and the transforms of one pair of frames.
 
-    Raises
-    ------
-    DescriptionError
-        The path is not a bag, or the wanted poses are missing; the message names those in the bag.
-    SetupError
-        The library for bags is not installed.
+    DescriptionError if the path is no bag, or lacks these poses; the message names those in it. SetupError without the
+    library for bags.
     """
     with open_bag(path, error=DescriptionError) as bag:
         covariances: list[np.ndarray] = []

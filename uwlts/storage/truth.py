@@ -82,7 +82,8 @@ def truth_path(capture: str | Path) -> Path:
 
 def write_truth(path: str | Path, header: TruthHeader, truth: Truth, *, overwrite: bool = False) -> None:
     """Write a truth file completely or not at all; raises OutputError if that fails."""
-    write_arrays(path, vars(truth), file_format=FORMAT, version=VERSION, header=header, overwrite=overwrite)
+    with write_arrays(path, file_format=FORMAT, version=VERSION, overwrite=overwrite) as append:
+        append(vars(truth), header)
 
 
 def read_truth(path: str | Path) -> tuple[TruthHeader, Truth]:

@@ -1,6 +1,7 @@
 """Stripes of all laser images of a capture, and reasons for missing stripes."""
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Iterator
 from typing import Literal
 
 import cv2
@@ -51,42 +52,42 @@ def find_stripes(
     One thread reads the images, and one thread per processor extracts stripes. A few images are in memory at a time,
     and the result does not depend on the number of processors.
 
-    Parameters
-    ----------
-    capture
-        Recording with images or centre lines.
-    options
-        Options, see `StripeOptions.of`.
-    progress
-        Called after each image with the number of processed images and the total number.
-
-    Raises
-    ------
-    CaptureError
-        The recording contains no laser image, or no laser image shows a stripe.
+    `StripeOptions.of` describes the options. ``progress`` is called after each image with the number of processed
+    images and the total number. CaptureError if the recording has no laser image, or none that shows a stripe.
     """
+    (whole,) = find_stripes_in_parts(capture, math.inf, options=options, progress=progress)
+    return whole
+
+
+def find_stripes_in_parts(
+    capture: BracketImages, most: float, *, options: StripeSettings = None, progress: ProgressListener = ignore_progress
+) -> Iterator[CaptureStripes]:
+    """Find the stripes as `find_stripes`, and yield them in parts of ``most`` to twice as many centres, or all."""
     along, full_dn = capture.header.sensor.camera.stripe_along, capture.header.saturation_dn
     chosen = StripeOptions.resolve(capture.header.sensor, options)
-    found: list[tuple[np.ndarray, ...]] = []
-    numbers: list[int] = []
+    # Image, statuses of its lines, and lines, centres, amplitudes and widths of its stripe.
+    found: list[tuple[int, np.ndarray, list[np.ndarray]]] = []
+    held = 0
 
     def extract(place: tuple[int, np.ndarray | Stripe, float]) -> Stripe:
         return direct_stripe_in(place[1], stripe_along=along, options=chosen, saturation=place[2])
 
     for (number, _, _), stripe in map_in_threads(extract, fuse_brackets(capture)):
-        numbers.append(number)
         good = stripe.lines
         of_lines = (values[good] for values in (stripe.centre_px, stripe.amplitude, stripe.width_px))
-        found.append((stripe.status, good, *of_lines))
+        found.append((number, stripe.status, [good, *of_lines]))
+        held += len(good)
         progress(number + 1, len(capture))
+        if held >= 2 * most:
+            counts = np.cumsum([len(columns[0]) for _, _, columns in found])
+            first = 1 + int(np.searchsorted(counts, most))
+            yield _join(found[:first])
+            found, held = found[first:], held - int(counts[first - 1])
     if not found:
         raise CaptureError(
             f"{capture.path.name} has {len(capture)} images, none of them with the laser on: nothing to reconstruct"
         )
-    status_of_lines, *columns = map(np.concatenate, zip(*found, strict=True))
-    statuses = np.bincount(status_of_lines, minlength=len(StripeStatus))
-    by_status = {status.name.lower(): int(statuses[status]) for status in StripeStatus}
-    if statuses[StripeStatus.OK] == 0:
+    if not held:
         if not capture.has_image[capture.laser_on].all():
             raise CaptureError(
                 f"no stripe in any of the {len(found)} centre lines of {capture.path.name}: is the laser on, the "
@@ -95,8 +96,16 @@ def find_stripes(
         lit = (capture.image(number) for number in np.flatnonzero(capture.laser_on).tolist())
         reason = explain_missing_stripe(lit, stripe_along=along, full_dn=full_dn)
         raise CaptureError(f"no stripe in any of the {len(found)} laser images of {capture.path.name}: {reason}")
-    frame = np.repeat(numbers, [len(good) for _, good, *_ in found])
-    return CaptureStripes(frame, *columns, lines_by_status=by_status)
+    yield _join(found)
+
+
+def _join(found: list[tuple[int, np.ndarray, list[np.ndarray]]]) -> CaptureStripes:
+    """Return the stripes of images: number, status of each line, and columns of the lines with a centre."""
+    numbers, status, columns = zip(*found, strict=True)
+    statuses = np.bincount(np.concatenate(status), minlength=len(StripeStatus))
+    by_status = {each.name.lower(): int(statuses[each]) for each in StripeStatus}
+    frame = np.repeat(numbers, [len(good) for good, *_ in columns])
+    return CaptureStripes(frame, *map(np.concatenate, zip(*columns, strict=True)), lines_by_status=by_status)
 
 
 def is_black(image: np.ndarray, full_dn: float) -> bool:

@@ -75,8 +75,7 @@ def direct_stripe(stripe: Stripe, rivals: StripeCandidates, *, jump_px: float) -
     single = np.bincount(line)[line] == 1
     before, after = np.empty((2, len(line)))
     _fit_slopes(line, centre, number, _RULE.gap_lines, before, after)
-    costs = _path_margins(line, centre, number, before, after, jump_px)
-    state = _take_best(line, costs, single, _RULE.margin)
+    state = _take_best(line, _path_margins(line, centre, number, before, after, jump_px), single, _RULE.margin)
     _refuse_single_runs(number, single, state)
     reach_px = _RULE.meeting_jumps * jump_px
     _open_meetings(line, centre, number, before, after, _RULE.meeting_lines, reach_px, state)

@@ -174,19 +174,16 @@ def _search_lines(
                 break
             there = np.float32(blocks[chosen])
             blocks[chosen] = 0
+            if _is_spike(profiles, line, chosen, there, near, rules):
+                continue
             start = (chosen - MARGIN) * rules.block - rules.half
-            if there < _RULE.clear * rules.fine:
-                cut_window(profiles, line, start + rules.half - 1, near)
-                if _is_spike(near, there, rules.fine):
-                    continue
             start, peak = _follow_peak(profiles, line, start, buffers, window, rules)
             verdict = _classify_peak(peak, start, profiles.shape[0], rules)
             if verdict == _NO_STRIPE:
                 wide[line] |= _is_too_wide(peak, start, profiles.shape[0], rules)
                 continue
             # `measure_peak` has searched this window for rivals.
-            for k in range(chosen - MARGIN, chosen + MARGIN + 1):
-                blocks[k] = 0
+            blocks[chosen - MARGIN : chosen + MARGIN + 1] = 0
             if status[line] == _OK:
                 # The flank of a wide stripe may have contrast in another block, which leads to the same stripe.
                 distance = abs(start + peak.middle - (peaks.start[count] + peaks.middle[count]))
@@ -223,9 +220,7 @@ def _mark_rivals(
         blocks = left[lines[m]]
         for k in range(MARGIN, blocks.size - MARGIN):
             if blocks[k] >= rules.coarse and not found[m]:
-                cut_window(profiles, lines[m], (k - MARGIN) * rules.block - 1, near)
-                there = np.float32(blocks[k])
-                found[m] = there >= _RULE.clear * rules.fine or not _is_spike(near, there, rules.fine)
+                found[m] = not _is_spike(profiles, lines[m], k, np.float32(blocks[k]), near, rules)
 
 
 @compiled
@@ -252,11 +247,9 @@ def _search_all(
                 break
             chosen = _find_first_equal(blocks, there)
             blocks[chosen] = 0
+            if _is_spike(profiles, line, chosen, np.float32(there), near, rules):
+                continue
             start = (chosen - MARGIN) * rules.block - rules.half
-            if there < _RULE.clear * rules.fine:
-                cut_window(profiles, line, start + rules.half - 1, near)
-                if _is_spike(near, np.float32(there), rules.fine):
-                    continue
             start, peak = _follow_peak(profiles, line, start, buffers, window, rules)
             verdict = _classify_peak(peak, start, profiles.shape[0], rules)
             if verdict == _NO_STRIPE and not _is_too_wide(peak, start, profiles.shape[0], rules):
@@ -386,18 +379,23 @@ def _choose_block(blocks: np.ndarray, highest: np.number, least: np.float32, rul
 
 
 @compiled_part
-def _is_spike(near: np.ndarray, there: np.float32, fine: float) -> bool:
-    """Return True if the contrast of a block is due to noise in single pixels.
+def _is_spike(
+    profiles: np.ndarray, line: int, block: int, there: np.float32, near: np.ndarray, rules: SearchRules
+) -> bool:
+    """Return True if the contrast ``there`` of a block is due to noise in single pixels.
 
-    This cheap test avoids a closer examination of most lines without light. ``near`` contains the pixels of the block
-    and one on either side. The mean of three pixels reduces a stripe less than the low-pass, after which it must still
-    be ``fine`` high.
+    This cheap test avoids a closer examination of most lines without light. ``near`` has room for the pixels of the
+    block and one on either side. The mean of three pixels reduces a stripe less than the low-pass, after which it must
+    still be ``rules.fine`` high.
     """
+    if there >= _RULE.clear * rules.fine:
+        return False
+    cut_window(profiles, line, (block - MARGIN) * rules.block - 1, near)
     single, mean = near[1], np.float32(-np.inf)
     for k in range(1, near.size - 1):
         single = max(single, near[k])
         mean = max(mean, near[k - 1] + near[k] + near[k + 1])
-    return there - (single - mean * np.float32(1.0 / 3.0)) < _RULE.spike * fine
+    return there - (single - mean * np.float32(1.0 / 3.0)) < _RULE.spike * rules.fine
 
 
 @compiled_part

@@ -12,6 +12,7 @@ import pytest
 from markupsafe import escape
 
 import twin
+import uwlts
 from twin.experiments.detection import ProbabilityOfDetection
 from twin.experiments.result import ExperimentResult
 from twin.experiments.runner import CommandLine, run_stages
@@ -119,7 +120,7 @@ def test_without_errors_there_is_no_verdict():
 
 
 def test_the_table_becomes_a_data_frame():
-    frame = TABLE.to_frame()
+    frame = uwlts.report.to_frame(TABLE)
     assert list(frame.columns[:4]) == ["campaign", "scan", "method", "figure"]
     assert frame["error_mm"].isna().tolist() == [False, True, False]
     assert frame["measured_mm"].tolist()[1] == 0.02
@@ -128,7 +129,7 @@ def test_the_table_becomes_a_data_frame():
 def test_a_missing_pandas_is_named_with_its_installation(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(SetupError, match=r"needs the library pandas.* -m pip install"):
-        TABLE.to_frame()
+        uwlts.report.to_frame(TABLE)
 
 
 def test_detections_have_their_own_table():

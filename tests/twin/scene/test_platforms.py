@@ -4,16 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from twin.scene.platform_kinds import (
-    LinearGuide,
-    Navigation,
-    Robot,
-    RotaryTable,
-    Sea,
-    Vehicle,
-    sample_waves,
-    simulate_drift,
-)
+from twin.scene.platform_kinds import Navigation, Robot, RotaryTable, Sea, Vehicle, sample_waves, simulate_drift
 from twin.scene.platforms import IdealPath
 from twin.scene.scene_object import Pose
 from uwlts.errors import DescriptionError
@@ -96,31 +87,6 @@ def test_stops_take_all_images_at_the_same_place():
         expected = Pose(**path.waypoints[place].model_dump()).matrix()
         np.testing.assert_allclose(course.reported[3 * place : 3 * place + 3], [expected] * 3, atol=1e-12)
         np.testing.assert_allclose(path.twist(course.shots[3 * place], exposure_s=0.01), 0, atol=1e-12)
-
-
-def test_a_guide_errs_by_the_ranges_of_its_description():
-    """Ranges over the travel, at 601 places: sampled extremes of waves of at most 4 periods lack less than 1e-3."""
-    guide = LinearGuide(
-        kind="linear_guide",
-        waypoints=ALONG,
-        speed_mm_per_s=100.0,
-        frame_rate_hz=200.0,
-        positioning_um=40.0,
-        straightness_um=(20.0, 10.0),
-        roll_arcsec=30.0,
-        pitch_arcsec=60.0,
-        yaw_arcsec=90.0,
-        errors_seed=3,
-    )
-    course = guide.course()
-    times = np.array([shot.time_s for shot in course.shots])
-    true = course.poses(times)
-    off = 1e3 * np.ptp(true[:, :3, 3] - course.reported[:, :3, 3], axis=0)
-    np.testing.assert_allclose(off, [40, 20, 10], rtol=2e-3)
-    turned = Rotation.from_matrix(true[:, :3, :3] @ np.swapaxes(course.reported[:, :3, :3], 1, 2)).as_rotvec()
-    np.testing.assert_allclose(np.degrees(np.ptp(turned, axis=0)) * 3600, [30, 60, 90], rtol=2e-3)
-    other = guide.model_copy(update={"errors_seed": 4}).course()
-    assert np.abs(other.poses(times) - true).max() > 1e-3
 
 
 def test_a_table_turns_the_sensor_the_other_way_round_its_axis():

@@ -9,10 +9,11 @@ import trimesh
 
 import uwlts
 from uwlts.cli import app
+from uwlts.comparison import surface_mesh
 from uwlts.comparison.change_reference import read_reference
 from uwlts.comparison.surface_mesh import _orient_faces, _remove_small_pieces, _split_scans, _thinnest_wall
 from uwlts.errors import CaptureError, EvaluationError, OutputError
-from uwlts.fitting.local_surface import SurfacePoints
+from uwlts.fitting.local_surface import SurfacePoints, surface_normals
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
 from uwlts.storage.mesh_file import read_mesh
 from uwlts.storage.ply import read_ply
@@ -213,6 +214,25 @@ def test_damaged_headers_and_absurd_vertices_are_refused(tmp_path):
     for name in ("a.ply", "b.obj"):
         with pytest.raises(CaptureError, match="not a complete PLY file|beyond 1e\\+10"):
             read_mesh(tmp_path / name)
+
+
+def test_noise_makes_no_walls(monkeypatch):
+    """Patches of 0.7 mm about points with 0.3 mm of noise have normals of all directions."""
+    rng, count = np.random.default_rng(9), 20_000
+    points = np.column_stack([rng.uniform(-7, 7, (count, 2)), 0.3 * rng.normal(size=count)])
+    normals = surface_normals(points, radius_mm=0.7, towards=np.array([0.0, 0.0, -1.0]))
+    rest = (
+        np.ones(count),
+        np.zeros(count),
+        np.zeros(count),
+        np.arange(count),
+        np.zeros((0, count)),
+        np.zeros(count, int),
+    )
+    found = SurfacePoints(points, normals, *rest)
+    assert _thinnest_wall(found, 0.7) == np.inf
+    monkeypatch.setattr(surface_mesh, "_RESOLVED", 0.0)
+    assert _thinnest_wall(found, 0.7) < 0.1
 
 
 def test_the_thinnest_wall_is_that_of_opposite_normals():

@@ -111,6 +111,17 @@ def test_what_is_not_assumed_does_not_fit():
     assert background > 1 > light
 
 
+def test_a_halo_of_another_form_leaves_the_attenuation_open():
+    """Strong daylight fell into the halo, and the attenuation was 50 % too large."""
+    evidence = draw(np.random.default_rng(5))
+    other = add_light(evidence, np.tile(100 * np.exp(-np.arange(1.0, TAIL_PX + 1) / 8), (BLOCKS, 1)))
+    for seen, open_values in ((evidence, set()), (other, {"attenuation_per_m", "scattering_per_m"})):
+        whole = seen.estimate(np.ones(BLOCKS, bool))
+        parts = seen.judge(whole, np.diag(np.hypot(0.05 * whole, 0.05) ** 2), NATURAL)
+        found = {name for part in parts if part.misfit > 1 for name in part.names}
+        assert found >= open_values and bool(found) is bool(open_values)
+
+
 def test_a_reflectance_with_the_path_shows_if_no_natural_water_absorbs_so_much():
     """The light doubles or halves over the 260 mm of path: the attenuation changes by ln 2 / 0.26 m = 2.7/m."""
     sensor = uwlts.load_sensor("thesis-small")

@@ -158,10 +158,11 @@ def test_two_sources_in_one_track_are_noticed(tmp_path, kind, pattern, offset):
     assert ["two sources" in each for each in warnings] == [True] * (len(pattern) > 1)
 
 
-def test_two_sources_apart_along_the_path_are_noticed(tmp_path):
+@pytest.mark.parametrize("pattern", [(0, 1), (0, 0, 1), (0, 0, 1, 1), (0, 0, 0, 1)])
+def test_two_sources_apart_along_the_path_are_noticed(tmp_path, pattern):
     times, places, quaternions = trajectory("steady")
     # The platform seems to go four steps forwards and two back.
-    places[1::2] += 3 * (places[1] - places[0])
+    places[np.resize(pattern, len(times)) == 1] += 3 * (places[1] - places[0])
     np.savetxt(tmp_path / "a.tum", np.column_stack([times, places / 1000, quaternions]), fmt="%.9f")
     (warning,) = read_trajectory(tmp_path / "a.tum", pose_format="tum").warnings
     assert "two sources" in warning

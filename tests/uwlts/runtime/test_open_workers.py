@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from uwlts.errors import SetupError
+from uwlts.runtime import workers
 from uwlts.runtime.workers import Lost, open_workers
 
 GUILTY = 7
@@ -83,7 +84,8 @@ def test_workers_share_the_threads_of_the_machine(tmp_path):
     assert pool.processes_for(processors) == 1 and pool.processes_for(1) == processors
 
 
-def test_no_scheduler_at_an_address():
+def test_no_scheduler_at_an_address(monkeypatch):
     nobody = "tcp://127.0.0.1:9"
-    with pytest.raises(SetupError, match="no Dask scheduler"), open_workers(scheduler=nobody, patience_s=1.0):
+    monkeypatch.setattr(workers, "_PATIENCE_S", 1.0)
+    with pytest.raises(SetupError, match="no Dask scheduler"), open_workers(scheduler=nobody):
         pass

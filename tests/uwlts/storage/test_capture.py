@@ -535,14 +535,14 @@ def test_failing_close_keeps_the_part(tmp_path: Path, monkeypatch):
     def failing(path: Path) -> None:
         raise RuntimeError("Can't decrement id ref count")
 
-    monkeypatch.setattr(capture_writer, "_truncate", failing)
+    monkeypatch.setattr(capture_writer, "truncate", failing)
     path = tmp_path / "a.h5"
     with pytest.raises(OutputError, match="ref count"):
         record(path, 2)
     assert list(tmp_path.iterdir()) == []
     monkeypatch.undo()
     writer = CaptureWriter(path, a_header(), dtype=np.uint8)
-    monkeypatch.setattr(capture_writer, "_truncate", failing)
+    monkeypatch.setattr(capture_writer, "truncate", failing)
     with pytest.raises(OutputError, match=r"ref count; complete frames are kept in a\.h5\.part"), writer:
         writer.append(a_frame(0))
     with Capture(part_path(path)) as capture:

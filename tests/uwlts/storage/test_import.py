@@ -292,6 +292,16 @@ def test_a_background_is_subtracted_with_its_sign(tmp_path: Path):
             assert np.abs(stored.centre_px - pair.centre_px)[pair.lines].max() < 1e-4
 
 
+def test_backgrounds_with_other_numbers_are_refused(tmp_path: Path):
+    images = {f"l{n}.png": stripe_image(seed=n) for n in (1, 2, 3)} | {f"w{n}.png": lamp_image(n) for n in (2, 3, 4)}
+    folder = folder_of(tmp_path, images, without("laser", laser="l*", background="w*"))
+    with pytest.raises(DescriptionError, match="numbers of laser and background images differ"):
+        import_images(folder, tmp_path / "a.h5")
+    for number in (4, 3, 2):  # numbers that interleave share none
+        (folder / f"w{number}.png").rename(folder / f"w{number + 2}.png")
+    import_images(folder, tmp_path / "a.h5")
+
+
 def saturated_images() -> tuple[np.ndarray, np.ndarray]:
     """Return a stripe (H, W) in colour that is white in its middle, and the same view without laser."""
     dark = np.full((HEIGHT, WIDTH, 3), 150, np.uint8)

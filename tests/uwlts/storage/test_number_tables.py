@@ -82,8 +82,9 @@ def test_contradictions_are_refused(tmp_path: Path, text: str, message: str):
         read_cloud(tmp_path / "a.csv")
 
 
-def test_a_unit_in_prose_is_doubted(tmp_path: Path):
-    (tmp_path / "a.xyz").write_text("# coordinates in metres\n1 2 3\n4 5 6\n")
+@pytest.mark.parametrize("words", ["coordinates in metres", "unit: US survey feet", "1 unit = 1 m", "unit: furlong"])
+def test_a_unit_in_prose_is_doubted(tmp_path: Path, words: str):
+    (tmp_path / "a.xyz").write_text(f"# {words}\n1 2 3\n4 5 6\n")
     found = read_cloud(tmp_path / "a.xyz")
     assert found.points_mm[0].tolist() == [1, 2, 3] and "another unit" in found.warnings[0]
 
@@ -196,6 +197,8 @@ def turning_left(path: Path, names: str, columns: str) -> Path:
         ("time_s,easting_m,northing_m,height_m,roll,pitch,yaw", "tenu00y", [1, 0, 0], [0, 1, 0]),
         ("time_s,north [m],east [m],down [m],roll,pitch,heading_deg", "tned00h", [0, 1, 0], [1, 0, 0]),
         ("time_s,North_m,East_m,Depth_m,roll,pitch,azimuth", "tned00h", [0, 1, 0], [1, 0, 0]),
+        ("time_s,N_m,E_m,D_m,roll,pitch,true_heading", "tned00h", [0, 1, 0], [1, 0, 0]),
+        ("time_s,x_north_m,y_east_m,z_down_m,roll,pitch,HDG_deg", "tned00h", [0, 1, 0], [1, 0, 0]),
     ],
 )
 def test_headings_belong_to_north_east_down(tmp_path: Path, names, columns, first, last):
@@ -211,7 +214,11 @@ def test_headings_belong_to_north_east_down(tmp_path: Path, names, columns, firs
     [
         ("time_s,x_m,y_m,z_m,roll,pitch,heading", "tenu00h", "clockwise from north"),
         ("time_s,east_m,north_m,up_m,roll,pitch,heading", "tenu00h", "clockwise from north"),
+        ("time_s,x_m,y_m,z_m,roll,pitch,course", "tenu00h", "clockwise from north"),
+        ("time_s,x_m,y_m,z_m,roll,pitch,compass_heading_deg", "tenu00h", "clockwise from north"),
         ("time_s,northing,easting,height,roll,pitch,yaw", "tneu00y", "left-handed frame"),
+        ("# time_s,N,E,U,roll,pitch,yaw", "tneu00y", "left-handed frame"),
+        ("time_s,pos_north,pos_east,alt,roll,pitch,yaw", "tneu00y", "left-handed frame"),
         ("time_s,east,north,depth,roll,pitch,yaw", "tend00y", "left-handed frame"),
     ],
 )

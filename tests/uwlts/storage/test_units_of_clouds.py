@@ -111,6 +111,8 @@ def test_las_in_degrees_and_unknown_units_is_refused(tmp_path: Path):
             uwlts.read(las_with(tmp_path / "a.las", **given))
     with pytest.raises(uwlts.Error, match="states the unit foot, but the unit m was given"):
         uwlts.read(las_with(tmp_path / "a.las", keys=((3076, 9002),)), unit="m")
+    (plain,) = uwlts.read(las_with(tmp_path / "a.las", wkt='PROJCS["no unit"]')).warnings
+    assert "states no unit of length" in plain
     assert "is it in feet" in uwlts.read(las_with(tmp_path / "a.las", keys=((3072, 2927),))).warnings[0]
 
 

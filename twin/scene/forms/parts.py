@@ -346,7 +346,7 @@ class Flange(FreeForm):
             parts.append(wall if number == 0 else wall[:, ::-1])
         corners, count = np.concatenate(solid), 2 * count
         for x, y in self.hole_places()[: self.bolts]:
-            vertices, hexagon = self._head(x, y)
+            vertices, hexagon = self._make_bolt_head(x, y)
             parts.append(hexagon + count)
             corners, count = np.concatenate([corners, vertices]), count + len(vertices)
         return corners, np.concatenate(parts)
@@ -390,7 +390,7 @@ class Flange(FreeForm):
             [np.arange(low, high) for low, high in pairwise(first)],
         )
 
-    def _head(self, x: float, y: float) -> tuple[np.ndarray, np.ndarray]:
+    def _make_bolt_head(self, x: float, y: float) -> tuple[np.ndarray, np.ndarray]:
         """Return vertices (12, 3) and faces of a hexagonal head over a hole."""
         angle = np.arctan2(y, x) + np.pi / 6 + np.pi / 3 * np.arange(6)
         edge = np.array([x, y]) + self.head_width_mm / np.sqrt(3) * np.stack([np.cos(angle), np.sin(angle)], axis=1)

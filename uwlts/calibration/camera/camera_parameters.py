@@ -33,6 +33,12 @@ class CameraOptions:
         if self.soft_limit_px is not None and not self.soft_limit_px > 0:
             raise DescriptionError(f"soft_limit_px must be positive, not {self.soft_limit_px}")
 
+    @property
+    def name(self) -> str:
+        """Coefficients and pixel shape of the lens model."""
+        names, shape = " ".join(self.distortion) or "no distortion", {None: "free pixels", 1.0: "square pixels"}
+        return f"{names}, {shape.get(self.pixel_aspect) or f'pixels of aspect {self.pixel_aspect:g}'}"
+
     def with_described_pixels(self, camera: Camera) -> "CameraOptions":
         """Return these options with the described pixel shape, unless it is estimated."""
         return self if self.pixel_aspect is None else replace(self, pixel_aspect=camera.pixel_aspect)

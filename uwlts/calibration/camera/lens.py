@@ -85,11 +85,6 @@ class LensCandidate:
     rms_px: float
     worse: float
 
-    @property
-    def name(self) -> str:
-        """Coefficients and pixel shape."""
-        return _name(self.options)
-
     def parameters(self) -> int:
         """Return the number of estimated parameters."""
         return len(self.options.distortion) + (4 if self.options.pixel_aspect is None else 3)
@@ -114,11 +109,6 @@ class LensCalibration:
     candidates: list[LensCandidate]  # compared models; empty if the model was given
     options: CameraOptions  # selected model
     covariance: np.ndarray  # (P, P); of the parameters, with correlated errors in each image
-
-    @property
-    def name(self) -> str:
-        """Name of the lens model."""
-        return _name(self.options)
 
     def values(self) -> dict[str, float]:
         """Return every estimated parameter."""
@@ -263,7 +253,10 @@ def calibrate_lens(
         without = _solve_subsets(centred, solution, all_but_one, solved_again)
         values, none = intrinsics.from_model(solution.model), np.full(len(intrinsics.names), np.nan)
         changes = np.array([none if s is None else intrinsics.from_model(s.model) - values for s in without])
-        others_std = np.array([none if s is None else _compute_std(s) for s in without])
+        # For points that scatter by at least `_FINEST_PX`.
+        larger = [0 if s is None else max(_FINEST_PX / max(s.sigma_px, _LEAST_SCATTER_PX), 1.0) for s in without]
+        std = [none if s is None else np.sqrt(np.diag(s.covariance)) for s in without]
+        others_std = np.array(larger)[:, None] * np.array(std)
         if not np.isfinite(changes).any():
             moved = np.full(len(used), np.nan)
             break
@@ -294,12 +287,6 @@ def calibrate_lens(
     )
 
 
-def _name(options: CameraOptions) -> str:
-    coefficients = " ".join(options.distortion) or "no distortion"
-    shape = {None: "free pixels", 1.0: "square pixels"}
-    return f"{coefficients}, {shape.get(options.pixel_aspect) or f'pixels of aspect {options.pixel_aspect:g}'}"
-
-
 def _candidates(any_of: Sequence[tuple[str, ...]], choice: LensChoice, poses: Poses) -> list[CameraOptions]:
     any_of = (_USUAL,) if poses == "stage-normal" else any_of
     sets = any_of if choice.distortion == "auto" else (choice.distortion,)
@@ -320,12 +307,6 @@ def _scatter(solution: CameraSolution) -> float:
     """Return the robust standard deviation of one coordinate of the residuals."""
     # median distance in two coordinates, divided by the standard deviation of one
     return float(np.median(np.linalg.norm(np.vstack(solution.residuals_px), axis=1))) / 1.1774
-
-
-def _compute_std(solution: CameraSolution) -> np.ndarray:
-    """Return the standard deviations (P,) of the parameters, for points that scatter by at least `_FINEST_PX`."""
-    larger = max(_FINEST_PX / max(solution.sigma_px, _LEAST_SCATTER_PX), 1.0)
-    return larger * np.sqrt(np.diag(solution.covariance))
 
 
 def _correct_circles(images: Sequence[TargetImage], solution: CameraSolution) -> list[TargetImage]:

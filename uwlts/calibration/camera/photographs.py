@@ -165,8 +165,7 @@ def calibrate_camera(
     for number, name in enumerate(names):
         try:
             raw = read_image(folder / name)
-            grey = extract_channel(raw, wanted, name=name)
-            view = described.detect(np.clip(grey, 0, None).astype(raw.dtype))
+            view = described.detect(np.clip(extract_channel(raw, wanted, name=name), 0, None).astype(raw.dtype))
             seen[number] = (raw.shape[1], raw.shape[0]), TargetImage(view.points_mm, view.pixels)
         except (ImageError, TargetError, CalibrationError) as error:
             reasons[name] = str(error).replace(f"{folder / name}", "it").removeprefix(f"{name} ")

@@ -151,12 +151,8 @@ class CameraSolution:
     stage_direction: np.ndarray | None
     """(3,) or None; unit direction of the sensor's motion by the stage, camera frame; None if free poses do not
     follow a stage."""
-    # Angle between that direction and the target's normal, and its standard deviation, for poses "stage"; the largest
-    # of all placements.
-    stage_tilt_rad: float | None
-    stage_tilt_std_rad: float | None
+    stage_tilt_rad: float | None  # largest angle of that direction to a placement's normal, for poses "stage"
     rounds: int
-    stopped: str  # reason why the iteration ended
     bias_px: list[np.ndarray] | None = None  # list of (N, 2) or None; corrected offsets of the circle images' centres
 
     def values(self) -> dict[str, float]:
@@ -178,8 +174,7 @@ class CameraSolution:
 
     def figures(self) -> dict[str, JsonValue]:
         """Return residuals, standard deviations and covariance for files; None for missing values."""
-        direction, tilt, tilt_std = self.stage_direction, self.stage_tilt_rad, self.stage_tilt_std_rad
-        bias_px = None if self.bias_px is None else np.linalg.norm(np.vstack(self.bias_px), axis=1)
+        direction = self.stage_direction
         return {
             "images": len(self.residuals_px),
             "points": sum(map(len, self.residuals_px)),
@@ -190,11 +185,6 @@ class CameraSolution:
             "parameters": list(self.parameters),
             "covariance": self.covariance.tolist(),
             "stage_direction": None if direction is None else direction.tolist(),
-            "stage_tilt_deg": None if tilt is None else float(np.degrees(tilt)),
-            "stage_tilt_std_deg": None if tilt_std is None else float(np.degrees(tilt_std)),
-            "largest_circle_bias_px": None if bias_px is None else float(bias_px.max()),
-            "rounds": self.rounds,
-            "stopped": self.stopped,
         }
 
 
@@ -337,8 +327,8 @@ def _solution(
     target_poses, directions, tilts = np.tile(np.eye(4), (len(images), 1, 1)), [], []
     residuals = [np.empty((0, 2))] * len(images)
     # Prior knowledge is the last group, after those of the views.
-    per_image = (each[: len(views)] for each in (fit.local, fit.local_covariances, fit.residuals))
-    for view, local, covariance, misses in zip(views, *per_image, strict=True):
+    per_image = (each[: len(views)] for each in (fit.local, fit.residuals))
+    for view, local, misses in zip(views, *per_image, strict=True):
         rotation = cv2.Rodrigues(local[:3])[0]
         directions.append(rotation @ view.direction(local[6:]))
         for index in np.unique(view.image):
@@ -347,12 +337,11 @@ def _solution(
             target_poses[index, :3, 3] = local[3:6] - view.shifts_mm[here][0] * directions[-1]
             residuals[index] = misses[here]
         if poses == "stage":
-            tilts.append(_measure_tilt(local[6:], covariance[6:, 6:]))
+            tilts.append(float(np.arctan(np.hypot(*local[6:]))))
     if poses == "free":
         stage = stage_direction(target_poses, np.array([image.stage_mm for image in images]))
     else:
         stage = np.mean(directions, axis=0) / np.linalg.norm(np.mean(directions, axis=0))
-    tilt, tilt_std = max(tilts, default=(None, None))
     return CameraSolution(
         model=intrinsics.model(fit.global_values),
         target_poses=target_poses,
@@ -361,18 +350,9 @@ def _solution(
         covariance=fit.covariance,
         sigma_px=fit.sigma,
         stage_direction=stage,
-        stage_tilt_rad=tilt,
-        stage_tilt_std_rad=tilt_std,
+        stage_tilt_rad=max(tilts, default=None),
         rounds=fit.rounds,
-        stopped=fit.stopped,
     )
-
-
-def _measure_tilt(tilt: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
-    """Return the angle in rad between the stage's direction and the normal, and its standard deviation."""
-    size = float(np.hypot(*tilt))
-    outward = tilt / size if size > 0 else np.array([1.0, 0.0])
-    return float(np.arctan(size)), float(np.sqrt(outward @ covariance @ outward)) / (1 + size**2)
 
 
 def stage_direction(target_poses: np.ndarray, stage_mm: np.ndarray) -> np.ndarray | None:

@@ -20,7 +20,7 @@ from uwlts.errors import CalibrationError
 from uwlts.model.calibration import Calibration, KnownStage, calibration_digest
 from uwlts.model.joint_estimate import CoveredRegion, JointEstimate, Origin
 from uwlts.model.parameter_keys import ParameterKey, TargetParameter
-from uwlts.model.sensor import Medium
+from uwlts.model.sensor import Medium, to_rows
 from uwlts.optics.fitness import check_fits
 from uwlts.storage.capture import Capture
 
@@ -163,7 +163,7 @@ def _extend_region(region: CoveredRegion, covered: Mapping[tuple[bool, int | Non
         update={
             "point_count": region.point_count + most.point_count,
             "camera_depth_mm": (min(depths), max(depths)),
-            "outline_mm": tuple(map(tuple, convex_outline(np.array([*region.outline_mm, *most.outline_mm])).tolist())),
+            "outline_mm": to_rows(convex_outline(np.array([*region.outline_mm, *most.outline_mm]))),
         }
     )
 

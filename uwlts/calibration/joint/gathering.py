@@ -148,7 +148,10 @@ def gather_jointly(
         found = find_air_evidence(captures, stripe=options.stripe, progress=progress)
         warnings += found.warnings
         directions = [capture.header.stage_direction for capture in captures]
-        series.append(Series(view, found, _find_approach(captures), directions))
+        # The stage moves the sensor towards the target, or away; None if it does not move along the OCS's Z.
+        along = [float(direction[2]) for direction in directions]
+        approach = min(along) > 0 if min(map(abs, along)) >= 0.9 and min(along) * max(along) > 0 else None
+        series.append(Series(view, found, approach, directions))
     for capture in steps:
         view, index = _identify_view(capture, media), options.medium_index
         found_steps, left_out = step_evidence([capture], medium_index=index, stripe=options.stripe, progress=progress)
@@ -215,12 +218,6 @@ def _identify_view(capture: Capture, media: dict[str, Medium], name: str | None 
     if media.setdefault(name, header.medium) != header.medium:
         raise CalibrationError(f"the captures use '{name}' for different media: {media[name]} and {header.medium}")
     return ViewMedium(window, list(media).index(name))
-
-
-def _find_approach(captures: Sequence[Capture]) -> bool | None:
-    """Return whether the stage moves the sensor towards the target; None if it does not move along the OCS's Z."""
-    along = {float(capture.header.stage_direction[2]) for capture in captures}
-    return min(along) > 0 if min(map(abs, along)) >= 0.9 and min(along) * max(along) > 0 else None
 
 
 def build_priors(

@@ -39,7 +39,7 @@ from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard
 from uwlts.model.calibration import Calibration, CameraModel, SheetModel, WindowModel
 from uwlts.model.parameter_keys import StepHeight
 from uwlts.model.placement import camera_from_object, laser_pose
-from uwlts.model.sensor import Sensor
+from uwlts.model.sensor import Sensor, to_rows
 from uwlts.model.stripe import stack_pixels
 from uwlts.optics.brightness import BLUR_STD, IlluminatedPoints, brightness_shift_std
 from uwlts.optics.camera import directions
@@ -89,7 +89,7 @@ class SeriesStart:
             camera=self.intrinsics.model(self.lens),
             window=self.window,
             sheet=sheet,
-            camera_from_object=tuple(map(tuple, frame.tolist())),
+            camera_from_object=to_rows(frame),
         )
 
     def sheet(self) -> tuple[DescribedSheet, np.ndarray] | None:

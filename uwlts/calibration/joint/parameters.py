@@ -70,12 +70,7 @@ class EarlierEstimate:
     """Earlier estimate of the first K parameters of a vector: ``values`` (K,), ``covariance`` (K, K).
 
     ``whitening`` (K, K) is W with W^T W the inverse of the covariance: W (x - values) are K independent residuals with
-    unit variance.
-
-    Raises
-    ------
-    CalibrationError
-        The covariance is not positive definite.
+    unit variance. CalibrationError if the covariance is not positive definite.
     """
 
     values: np.ndarray
@@ -248,7 +243,7 @@ class Parameters:
 
     def sheet_model(self, values: np.ndarray) -> SheetModel:
         """Return the sheet of a vector."""
-        return self.sheet.model(self._sheet_values(values))
+        return self.sheet.model(self._select_sheet_values(values))
 
     def medium_index(self, values: np.ndarray, view: ViewMedium) -> float:
         """Return the refractive index of a view's medium relative to air."""
@@ -277,7 +272,7 @@ class Parameters:
         moved = rays.origins_by + reach * rays.directions_by
         along = -np.einsum("in,cin->cn", surface.gradient(points), moved) / slope
         by_rays = moved + along[:, None] * rays.directions
-        by_sheet = -self.sheet.miss_by(self._sheet_values(values), points, index) / slope
+        by_sheet = -self.sheet.miss_by(self._select_sheet_values(values), points, index) / slope
         by = np.empty((len(pixels), 3, 1 + len(self.keys)))
         by[:, :, 0] = by_rays[across].T
         for axis in range(3):
@@ -318,7 +313,7 @@ class Parameters:
         """Return the key of the index of a medium."""
         return MediumIndex(self.media[medium])
 
-    def _sheet_values(self, values: np.ndarray) -> np.ndarray:
+    def _select_sheet_values(self, values: np.ndarray) -> np.ndarray:
         return np.array([self.value(values, key) for key in SHEET])
 
 

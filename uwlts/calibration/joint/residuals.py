@@ -245,8 +245,7 @@ class TargetEvidence(StripeEvidence):
         """Return the evidence of some images; stage positions still refer to the first image of all."""
         here = np.isin(self.placement.image, wanted)
         kept = {name: getattr(self.placement, name)[here] for name in ("points_mm", "shifts_mm", "pixels", "image")}
-        some = replace(self, placement=replace(self.placement, **kept))
-        return some.with_stripes(np.isin(self.image, wanted))
+        return replace(self, placement=replace(self.placement, **kept)).with_stripes(np.isin(self.image, wanted))
 
     def with_centres(
         self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray, diameter_mm: float

@@ -20,7 +20,7 @@ from uwlts.fitting.propagation import differences
 from uwlts.model.calibration import Calibration, KnownMedium
 from uwlts.model.joint_estimate import CoveredRegion, ImageFit, JointEstimate
 from uwlts.model.parameter_keys import LensParameter, MediumIndex, SheetParameter, WindowParameter, parse_parameter
-from uwlts.model.sensor import Medium, Sensor, Table, Uncertainty
+from uwlts.model.sensor import Medium, Sensor, Table, Uncertainty, to_rows
 from uwlts.model.stripe import stack_pixels
 
 _FRAME_STEP = 1e-5
@@ -47,7 +47,7 @@ def build_calibration(
         camera=parameters.camera(values),
         window=parameters.window_model(values),
         sheet=sheet,
-        camera_from_object=tuple(map(tuple, frame.tolist())),
+        camera_from_object=to_rows(frame),
         media=tuple(KnownMedium(medium=m, index=index) for m, index in zip(media, indices, strict=True)),
         residuals=_lens_and_window(result),
         joint=_build_joint_estimate(result, evidence, frame),
@@ -79,7 +79,7 @@ def _build_joint_estimate(result: Estimate, evidence: Sequence[Evidence], object
         values=tuple(result.values.tolist()),
         std=tuple(result.std().values()),
         std_before=tuple(float(std) if np.isfinite(std) else None for std in result.parameters.prior_std()),
-        covariance=tuple(map(tuple, result.covariance.tolist())),
+        covariance=to_rows(result.covariance),
         nominal_sheet=result.parameters.sheet.nominal(),
         scatter_px={kind: noise.sigma_px for kind, noise in result.noise.items()},
         shared_variance={kind: noise.together for kind, noise in result.noise.items()},
@@ -120,7 +120,7 @@ def _build_covered_region(
         window=view.window,
         point_count=len(at),
         camera_depth_mm=(float(seen[2].min()), float(seen[2].max())),
-        outline_mm=tuple(map(tuple, np.round(convex_outline(at), 3).tolist())),
+        outline_mm=to_rows(np.round(convex_outline(at), 3)),
     )
 
 

@@ -35,6 +35,7 @@ from uwlts.files.writing import hash_file
 from uwlts.fitting.propagation import differences
 from uwlts.model.calibration import Calibration, CameraModel, WindowModel, rigid_transform
 from uwlts.model.mount import BoardFound, Mount, MountPose
+from uwlts.model.sensor import to_rows
 from uwlts.optics.camera import directions, project_through_window
 from uwlts.optics.fitness import check_fits
 from uwlts.optics.window import trace_window
@@ -159,10 +160,10 @@ def mount_by_board(
     distance = float(np.median([image.camera_from_target[2, 3] for image in used.images]))
     rms_px = float(np.sqrt(np.mean([image.rms_px**2 for image in used.images])))
     return Mount(
-        T_platform_sensor=tuple(map(tuple, state[0].tolist())),
+        T_platform_sensor=to_rows(state[0]),
         covariance=tuple(tuple(row) for row in covariance[:6, :6].tolist()),
         coverage_factor=factor,
-        artefact=BoardFound(T_base_target=tuple(map(tuple, state[1].tolist()))),
+        artefact=BoardFound(T_base_target=to_rows(state[1])),
         point_std_mm=rms_px * distance / camera.model.fx_px,
         pose_std_mm=float(position_mm),
         rms_mm=float(np.sqrt(np.mean(rms**2))),

@@ -301,8 +301,7 @@ class Problem(GroupedEvidence[MountState]):
         """
         if not self.shape.flat:
             return values
-        ends = np.cumsum(self.counts)[:-1]
-        parts = zip(self._lines, np.split(values, ends), strict=True)
+        parts = zip(self._lines, np.split(values, np.cumsum(self.counts)[:-1]), strict=True)
         return np.concatenate([basis @ (basis.T @ part) for basis, part in parts])
 
     def noise_along(self, state: MountState) -> np.ndarray:

@@ -78,8 +78,7 @@ def _start_on_table(problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray,
     rotations, positions = problem.motion(0.0)
     angles = -Rotation.from_matrix(rotations[0].T @ rotations).as_rotvec()[:, 2]
     centres, radii = np.array([arc.centre_mm for arc in arcs]), np.array([arc.radius_mm for arc in arcs])
-    design = np.column_stack([np.ones(len(arcs)), np.cos(angles), np.sin(angles)])
-    flat = _solve_robustly(design, centres)
+    flat = _solve_robustly(np.column_stack([np.ones(len(arcs)), np.cos(angles), np.sin(angles)]), centres)
     largest, states = float(np.quantile(radii, 0.9)), []
     root = np.sqrt(complex(flat[2] @ flat[2] - flat[1] @ flat[1], -2 * flat[1] @ flat[2]))
     for radius in [problem.shape.radius_mm] if problem.shape.radius_mm else [share * largest for share in _RADII]:
@@ -145,8 +144,7 @@ def _misfit(
 ) -> float:
     """Return the median distance over the poses between the sphere's centre and its position from the profile."""
     seen = (_rotate_back(rotations, state.artefact[:3] - positions) - state.translation) @ state.rotation
-    off = np.hypot(*(seen[:, [0, 2]] - centres).T)
-    return float(np.median(np.hypot(off, np.abs(seen[:, 1]) - depth)))
+    return float(np.median(np.hypot(np.hypot(*(seen[:, [0, 2]] - centres).T), np.abs(seen[:, 1]) - depth)))
 
 
 def _start_of_plane(
@@ -191,8 +189,7 @@ def _refine_best(problem: Problem, states: list[MountState], sheet: np.ndarray) 
 
     Scale and time offset are not refined.
     """
-    thinned = [thin(each, _THINNED) for each in problem.points]
-    fixed = replace(problem, points=thinned, scale=False, time=False)
+    fixed = replace(problem, points=[thin(each, _THINNED) for each in problem.points], scale=False, time=False)
     turns = [state.rotation @ sheet[:3, :3].T for state in states]
     moved = [
         replace(state, rotation=turn, translation=state.translation - turn @ sheet[:3, 3])

@@ -20,6 +20,7 @@ from uwlts.errors import CalibrationError, RangeError
 from uwlts.fitting.least_squares import DEFAULT_K, robust_std
 from uwlts.model.calibration import PolynomialCalibration
 from uwlts.model.placement import laser_pose
+from uwlts.model.sensor import to_rows
 from uwlts.model.short_text import Brief
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.triangulation import reconstruct_pixels
@@ -443,10 +444,10 @@ def fit_polynomials(
         position_range_px=depth.range,
         depth_range_mm=along.range,
         domains_px=tuple(tuple(pair) if np.isfinite(pair[0]) else None for pair in domains.tolist()),
-        depth_coefficients=tuple(map(tuple, depth.coefficients[rows[0]].tolist())),
-        along_coefficients=tuple(map(tuple, along.coefficients[rows[1]].tolist())),
+        depth_coefficients=to_rows(depth.coefficients[rows[0]]),
+        along_coefficients=to_rows(along.coefficients[rows[1]]),
     )
-    map_rms_mm = _rms_length(np.concatenate([m.residuals for m in maps]))
+    map_rms_mm = float(np.sqrt(np.mean(np.sum(np.concatenate([m.residuals for m in maps]) ** 2, axis=1))))
     used, lines = depth.used, stripes.lines
     excess, along_excess = _line_excess(depth, lines), _line_excess(along, lines[used])
     poses, stripe_points = np.unique(stripes.pose, return_counts=True)
@@ -455,11 +456,7 @@ def fit_polynomials(
             "stage_mm": [evidence.images[pose].stage_mm for pose in poses.tolist()],
             "stripe_points": stripe_points.tolist(),
         },
-        "map": {
-            "rms_mm": map_rms_mm,
-            "largest_image_rms_mm": max(_rms_length(m.residuals) for m in maps),
-            "points": sum(len(m.residuals) for m in maps),
-        },
+        "map": {"rms_mm": map_rms_mm, "points": sum(len(m.residuals) for m in maps)},
         "depth": _fit_figures(depth, excess, stripes.pose),
         "along": _fit_figures(along, along_excess, stripes.pose[used]),
     }
@@ -480,10 +477,6 @@ def fit_polynomials(
     return PolynomialResult(calibration, stripes, depth, along, warnings)
 
 
-def _rms_length(vectors: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
-
-
 def _line_excess(fit: LinePolynomials, lines: np.ndarray) -> float:
     """Return the scatter of the lines' means relative to its expectation by chance, std / sqrt(n)."""
     _, line, count = np.unique(lines[fit.used], return_inverse=True, return_counts=True)
@@ -498,7 +491,6 @@ def _fit_figures(fit: LinePolynomials, excess: float, pose: np.ndarray) -> dict[
     _, image, points = np.unique(pose[used], return_inverse=True, return_counts=True)
     return {
         "rms_mm": fit.rms(),
-        "mean_absolute_mm": float(np.mean(np.abs(left[used]))),
         "max_mm": float(np.max(np.abs(left[used]))),
         "points": int(np.count_nonzero(used)),
         "rejected_share": float(np.mean(~used)),

@@ -42,7 +42,7 @@ from uwlts.errors import CalibrationError
 from uwlts.fitting.propagation import jackknife
 from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.placement import camera_from_object, laser_pose
-from uwlts.model.sensor import Sensor, Window
+from uwlts.model.sensor import Sensor, Window, to_rows
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import Capture, describe_source
 from uwlts.stripe import StripeSettings
@@ -212,7 +212,7 @@ def solve(evidence: Evidence, *, options: CalibrationOptions) -> CalibrationResu
     )
     if lens is not None:
         sheet, angle = _add_image_uncertainty(sheet, lens, found), _angle_between_halves(sheet, lens, found)
-        figures["camera"] |= _lens_figures(lens, found)
+        figures["camera"] |= _list_lens_figures(lens, found)
         warnings += lens.half_doubts()
         if angle is not None:
             text = f"their sheets differ by {np.degrees(angle):.3f} deg"
@@ -228,7 +228,7 @@ def solve(evidence: Evidence, *, options: CalibrationOptions) -> CalibrationResu
         camera=camera.model,
         window=None,
         sheet=sheet.model,
-        camera_from_object=tuple(map(tuple, object_frame(sheet.model, laser_axis=pose.axis).tolist())),
+        camera_from_object=to_rows(object_frame(sheet.model, laser_axis=pose.axis)),
     )
     used, on_steps, window = [], [], None
     if evidence.window is not None:
@@ -317,7 +317,7 @@ def _calibrate_camera(
     return camera, lens, used, warnings
 
 
-def _lens_figures(lens: LensCalibration, found: AirEvidence) -> dict[str, JsonValue]:
+def _list_lens_figures(lens: LensCalibration, found: AirEvidence) -> dict[str, JsonValue]:
     """Return compared models and used images for files; None for missing values."""
     rms = lens.solution.image_rms_px()
     columns = zip(found.names(), found.images, rms, lens.moved, found.stripes, found.outliers, strict=True)
@@ -333,11 +333,12 @@ def _lens_figures(lens: LensCalibration, found: AirEvidence) -> dict[str, JsonVa
         for name, image, miss, moved, stripe, outliers in columns
     ]
     tried: list[JsonValue] = [
-        {"model": each.name, "rms_px": each.rms_px if np.isfinite(each.rms_px) else None} for each in lens.candidates
+        {"model": each.options.name, "rms_px": each.rms_px if np.isfinite(each.rms_px) else None}
+        for each in lens.candidates
     ]
     return {
         "halves": [{**half} for half in lens.half_values()],
-        "lens_model": lens.name,
+        "lens_model": lens.options.name,
         "models_tried": tried,
         "rejected_share": lens.rejected_share,
         "images_left_out": len(lens.left_out),

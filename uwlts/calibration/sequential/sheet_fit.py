@@ -108,11 +108,8 @@ def fit_sheet(
     The normal is oriented to the side of ``nominal_normal`` (3,), a unit vector, all in the camera frame.
     ``largest_rejected`` is the permitted fraction of outliers.
 
-    Raises
-    ------
-    CalibrationError
-        The points do not determine a plane or are not on one, or its normal is far from the nominal one. Its distance
-        from the camera differs from ``nominal_offset_mm`` by a factor that indicates wrong units.
+    CalibrationError if the points do not determine a plane or are not on one, or its normal is far from the nominal
+    one. The same if its distance from the camera differs from ``nominal_offset_mm`` as by wrong units.
     """
     try:
         robust = fit_robustly(Plane.fit, points_mm, towards=nominal_normal)

@@ -36,14 +36,8 @@ def unpack_images(bag: Path, given: ImportDescription, out: Path) -> Iterator[tu
     An image is TOPIC/NUMBER.png, or .jpg if it is compressed; topics without a described light are left out. The
     description gets the table of times and the Bayer pattern if it states none.
 
-    Raises
-    ------
-    ImageError
-        The bag is damaged, the description names no images in it, or an image has another encoding.
-    OutputError
-        The folder of ``out`` is not writable, or the disk is full.
-    SetupError
-        The library for bags is not installed.
+    ImageError if the bag is damaged, the description names no images in it, or an image has another encoding;
+    OutputError if the folder of ``out`` is not writable, or the disk is full; SetupError without the library for bags.
     """
     rows, pattern = ["file,time_s"], given.bayer
     wanted = given.laser, given.lamp, given.background

@@ -76,13 +76,13 @@ def read_rows(path: Path) -> list[ImageRow]:
             f"{path} has the columns {', '.join(columns)}; expected file and any of "
             f"{', '.join(_COLUMNS[1:7])}, pose_00 to pose_33, each once"
         )
-    rows = [_row(number, cells, f"{path}, line {line}") for number, (line, cells) in enumerate(found)]
+    rows = [_parse_row(number, cells, f"{path}, line {line}") for number, (line, cells) in enumerate(found)]
     twice = sorted(name for name, count in Counter(row.file for row in rows).items() if count > 1)
     _refuse_any(twice, f"{path} names ", " more than once: one line for each image")
     return rows
 
 
-def _row(number: int, cells: dict[str, str], place: str) -> ImageRow:
+def _parse_row(number: int, cells: dict[str, str], place: str) -> ImageRow:
     if None in cells or None in cells.values():
         raise DescriptionError(f"{place}: there are more or fewer cells than columns")
     texts = dict.fromkeys(_COLUMNS, "") | {name: cell.strip() for name, cell in cells.items()}
@@ -207,11 +207,12 @@ def _add_backgrounds(folder: Path, found: list[str], given: ImportDescription, l
             "each, else name them in a table's column background"
         )
     one, other = count_names(found), count_names([row.file for row in laser])
-    if one and other and len(found) > 1 and (one.places() != other.places()).any():
-        raise DescriptionError(
-            "the numbers of laser and background images have different gaps: name the backgrounds in a table's column "
-            "background"
-        )
+    if one and other and len(found) > 1:
+        first = int(one.numbers[0]) if set(one.numbers) & set(other.numbers) else None
+        if (one.places(first) != other.places(first)).any():
+            raise DescriptionError(
+                "the numbers of laser and background images differ: name the backgrounds in a table's column background"
+            )
     names = found * len(laser) if len(found) == 1 else found
     return [replace(row, background=name) for row, name in zip(laser, names, strict=True)]
 

@@ -47,8 +47,7 @@ def remove_doubtful(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
     """Remove corners (J, I, 2) that differ from their neighbours or are not between four squares."""
     grid = grid.copy()
     there = np.argwhere(np.isfinite(grid[..., 0]))
-    doubtful = np.delete(there, select_agreeing(grid[tuple(there.T)], there), axis=0)
-    grid[tuple(doubtful.T)] = np.nan
+    grid[tuple(np.delete(there, select_agreeing(grid[tuple(there.T)], there), axis=0).T)] = np.nan
     grid[_compare_squares(grey, grid)[1] == 0] = np.nan
     return grid
 

@@ -260,8 +260,7 @@ def _update_ellipses(grey, ellipses, longest, noise):
     change = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
     rms = np.sqrt(np.maximum(squares - (right * change).sum(1), 0.0) / (PROFILES - 5))
     centres, shapes = ellipses.centres + change[:, :2], ellipses.shapes + change[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
-    sharpness = slope / np.where(whole, contrast, 1.0)
-    moved = Ellipses(centres, shapes, ellipses.bright, rms, contrast, sharpness)
+    moved = Ellipses(centres, shapes, ellipses.bright, rms, contrast, slope / np.where(whole, contrast, 1.0))
     return moved, whole & (np.linalg.eigvalsh(shapes)[:, 0] > 1.0)
 
 

@@ -55,8 +55,7 @@ def select_agreeing(points, indices):
     if len(points) == 0:
         return np.empty(0, np.int64)
     low = indices.min(0) - LATTICE_RULE.neighbourhood
-    shape = indices.max(0) - low + LATTICE_RULE.neighbourhood + 1
-    member = np.full(shape, -1)
+    member = np.full(indices.max(0) - low + LATTICE_RULE.neighbourhood + 1, -1)
     place = indices - low
     member[tuple(place.T)] = np.arange(len(points))
     span = np.arange(-LATTICE_RULE.neighbourhood, LATTICE_RULE.neighbourhood + 1)
@@ -72,8 +71,7 @@ def select_agreeing(points, indices):
             valid &= ~alone
             continue
         excess = _relative_errors(points, around, present, terms, valid)
-        rivals = np.where(present, excess[around], 0.0).max(1)
-        wrong = valid & (excess > 1) & (excess >= rivals)
+        wrong = valid & (excess > 1) & (excess >= np.where(present, excess[around], 0.0).max(1))
         if not wrong.any():
             break
         valid &= ~wrong
@@ -179,8 +177,7 @@ def _find_bases(centres, shapes, tree):
 
     The second step is zero if there is no such neighbour.
     """
-    count = min(LATTICE_RULE.candidates + 1, len(centres))
-    _, index = tree.query(centres, k=count)
+    _, index = tree.query(centres, k=min(LATTICE_RULE.candidates + 1, len(centres)))
     steps = centres[index[:, 1:]] - centres[:, None]
     seen = steps @ np.linalg.inv(shapes)
     length = np.linalg.norm(seen, axis=2)
@@ -201,8 +198,7 @@ def _cross(p, q):
 
 def _choose_seeds(centres, radii, bases, sines, tree):
     """Return circles with four neighbours where their steps predict them, the most regular ones first."""
-    expected = centres[:, None] + np.concatenate([bases, -bases], 1)
-    distance, index = tree.query(expected)
+    distance, index = tree.query(centres[:, None] + np.concatenate([bases, -bases], 1))
     step = np.linalg.norm(bases, axis=2)
     miss = (distance / np.maximum(np.tile(step, 2), 1e-9)).max(1)
     ratio = np.abs(np.log(radii[index] / radii[:, None])).max(1)

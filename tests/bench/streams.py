@@ -1,0 +1,108 @@
+"""Memory of the reconstruction of long rides: profiles of a 3D camera on a vehicle, with path, mount and covariance."""
+
+import os
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import h5py
+import numpy as np
+
+from tests.uwlts.mount_views import known_mount
+from uwlts.model.library import load_sensor
+from uwlts.model.sensor import CaptureHeader
+from uwlts.model.stripe import Coordinates
+from uwlts.model.trajectory import Trajectory
+from uwlts.recalibration.as_built import as_built
+from uwlts.storage.capture import Frame
+from uwlts.storage.capture_writer import CaptureWriter
+
+RATE_HZ, SPEED_MM_PER_S, NOISE_PX = 200.0, 100.0, 0.1
+"""Of the profiles, of the vehicle, and of the stripe centres."""
+RECONSTRUCT = (
+    "uwlts reconstruct ride.h5 --calibration calibration.json --mount mount.json --trajectory path.csv "
+    "--pose-format quaternion-xyzw --out ride.cloud.h5"
+)
+_DIFFERENT = 50  # profiles that are written one by one; further ones are copies
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Cost of a command, and the most memory that it may take."""
+
+    command: str
+    seconds: float
+    processor_s: float
+    peak_gb: float
+    limit_gb: float
+
+
+def stream_memory(few: int, many: int) -> tuple[float, float]:
+    """Return the peak memory of the longer ride in GB, and the growth in kB per profile."""
+    peaks = []
+    for frames in (few, many):
+        with TemporaryDirectory() as name:
+            write_ride(Path(name), frames)
+            peaks.append(run_alone(RECONSTRUCT, Path(name), np.inf).peak_gb)
+    return peaks[1], 1e6 * (peaks[1] - peaks[0]) / (many - few)
+
+
+def write_ride(folder: Path, frames: int) -> None:
+    """Write capture, joint calibration, mount and trajectory of a ride, for `RECONSTRUCT`."""
+    sensor, rng = load_sensor("thesis-small"), np.random.default_rng(65)
+    water, camera = sensor.media["water"], sensor.camera
+    header = CaptureHeader(
+        name="ride",
+        sensor=sensor,
+        medium_name="water",
+        medium=water,
+        stage_direction=(1.0, 0.0, 0.0),
+        saturation_dn=255,
+    )
+    as_built(sensor, water).save(folder / "calibration.json")
+    known_mount(np.eye(4), time_offset_s=0.0, time_offset_std_s=1e-4).save(folder / "mount.json")
+    lines, length = camera.lines(), camera.height_px if camera.stripe_along == "width" else camera.width_px
+    place = np.arange(lines)
+    with CaptureWriter(folder / "ride.h5", header, dtype=np.dtype(np.uint8), centre_lines=True) as writer:
+        for k in range(min(frames, _DIFFERENT)):
+            # A wavy bottom, without every fortieth line.
+            centre = length * (0.5 + 0.1 * np.sin(2 * np.pi * (place / 200 + k / _DIFFERENT)))
+            centre = np.where(place % 40 == 0, np.nan, centre + NOISE_PX * rng.normal(size=lines))
+            rows = np.stack([centre, 100 + rng.normal(size=lines), np.full(lines, 4.0)])
+            profile = Coordinates().stripe(rows, stripe_along=camera.stripe_along, length_px=length)
+            writer.append(Frame(profile, 0.0, True, 1.0, k / RATE_HZ))
+    with h5py.File(folder / "ride.h5", "r+") as file:
+        for name, dataset in file.items():
+            first = dataset[...]
+            dataset.resize(frames, axis=0)
+            if name == "time_s":
+                dataset[...] = np.arange(frames) / RATE_HZ
+            elif name != "frames":
+                dataset[...] = np.resize(first, dataset.shape)
+    times = np.linspace(-1.0, frames / RATE_HZ + 1.0, max(20, frames // 10))
+    poses = np.tile(np.eye(4), (len(times), 1, 1))
+    poses[:, 0, 3] = SPEED_MM_PER_S * times
+    drift = ((times - times[0]) / (times[-1] - times[0]) + 0.01)[:, None, None] ** 2
+    navigation = Trajectory(times, poses, drift * np.diag(np.square(np.repeat([300.0, np.radians(1.0)], 3))))
+    navigation.save(folder / "path.csv")
+
+
+def run_alone(line: str, folder: Path, limit_gb: float) -> Cost:
+    """Run a command in a process of its own and return its cost; ends with its exit code if it fails."""
+    program, *arguments = line.split()
+    command = [sys.executable, "-m", program, *arguments, "--quiet"]
+    environment = os.environ | {"PYTHONPATH": str(Path.cwd()), "OPENBLAS_NUM_THREADS": "1"}
+    start, own = time.perf_counter(), Path.cwd()
+    os.chdir(folder)
+    try:
+        child = os.posix_spawn(sys.executable, command, environment)
+    finally:
+        os.chdir(own)
+    _, status, usage = os.wait4(child, 0)
+    if code := os.waitstatus_to_exitcode(status):
+        sys.exit(code)
+    # ru_maxrss is in KiB.
+    peak_gb = usage.ru_maxrss * 1024 / 1e9
+    return Cost(line, time.perf_counter() - start, usage.ru_utime + usage.ru_stime, peak_gb, limit_gb)
