@@ -36,6 +36,7 @@ def sphere_campaign(
     noise_mm: float = 0.03,
     robot_mm: float = 0.0,
     tilt_deg: float = 25.0,
+    background: bool = True,
     scale: float = 1.0,
     plane_only: bool = False,
     smooth_mm: float = 0.0,
@@ -57,7 +58,9 @@ def sphere_campaign(
         base_sensor[:3, :3] = looking_down.as_matrix()
         base_sensor[:3, 3] = SPHERE_MM - base_sensor[:3, :3] @ place
         base_platform = base_sensor @ np.linalg.inv(MOUNT)
-        profile = profile_of(base_sensor, rng, noise_mm=noise_mm, sphere=not plane_only, count=rays)
+        profile = profile_of(
+            base_sensor, rng, noise_mm=noise_mm, background=background, sphere=not plane_only, count=rays
+        )
         if smooth_mm:
             profile[:, 1] += smooth_mm * _smooth_errors(profile[:, 0], rng)
         profiles.append(profile)
@@ -75,13 +78,21 @@ def _smooth_errors(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def profile_of(
-    base_sensor: np.ndarray, rng: np.random.Generator, *, noise_mm: float, sphere: bool = True, count: int = RAYS
+    base_sensor: np.ndarray,
+    rng: np.random.Generator,
+    *,
+    noise_mm: float,
+    background: bool = True,
+    sphere: bool = True,
+    count: int = RAYS,
 ) -> np.ndarray:
     """Return the profile of a sensor at ``T_base_sensor``: x and z (N, 2) in mm, with noise along z and gaps."""
     angles = np.radians(np.linspace(-18, 18, count))
     rays = np.column_stack([np.sin(angles), np.zeros(count), np.cos(angles)])
     directions, origin = rays @ base_sensor[:3, :3].T, base_sensor[:3, 3]
-    length = (SPHERE_MM[2] - 1.1 * RADIUS_MM - origin[2]) / directions[:, 2]
+    length = np.full(count, np.inf)
+    if background:
+        length = (SPHERE_MM[2] - 1.1 * RADIUS_MM - origin[2]) / directions[:, 2]
     if sphere:
         away = origin - SPHERE_MM
         half = directions @ away
