@@ -100,3 +100,13 @@ def test_a_cut_board_partly_in_view_is_right_or_ambiguous(described, more, rim, 
         true = project_points(points + first, RAYS, place, start=view.pixels)
         errors.append(np.linalg.norm(view.pixels - true, axis=1).max())
     assert min(errors) < 0.4
+
+
+def test_a_cut_board_whose_next_corners_would_be_in_the_image_is_not_read_a_quarter_turn_off():
+    """Its 6 x 4 whole corners fit 8 x 6 turned by 90 deg; half of the row beyond them would then be in the image."""
+    place = pose((4.1, -6.9, -18.4), (-29.0, -38.4, 300.0))
+    place[:3, 3] -= place[:3, :3] @ [70.0, 50.0, 0.0]
+    levels = chessboard(8, 6, 20.0, rims=(0.08, 0.08, 0.08, 0.08))
+    image = draw(levels, RAYS, place, size=SIZE, rng=np.random.default_rng(7), samples=2)
+    with pytest.raises(TargetError, match="more than one way"):
+        ChessboardTarget(columns=8, rows=6, square_mm=20.0).detect(image)

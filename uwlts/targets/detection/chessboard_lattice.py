@@ -215,11 +215,11 @@ def _place_piece(piece: np.ndarray, columns: int, rows: int, shape: tuple[int, .
 
 
 def _is_side(last: np.ndarray, before: np.ndarray, shape: tuple[int, ...]) -> bool:
-    """Return True if a row of corners (K, 2) is a side of the board: most of the next ones would be in the image."""
+    """Return True if a row of corners (K, 2) is a side of the board: two of the next ones would be in the image."""
     beyond = (2.0 * last - before)[np.isfinite(last[:, 0]) & np.isfinite(before[:, 0])]
     rim = _Rule.ring_px + _Rule.rim_px
     inside = (beyond > rim) & (beyond < np.array(shape[::-1]) - 1 - rim)
-    return bool(len(beyond) and inside.all(axis=1).mean() > 0.5)
+    return np.count_nonzero(inside.all(axis=1)) > 1
 
 
 def _harmonics(grey: np.ndarray, pixels: np.ndarray, radius: float) -> np.ndarray:
