@@ -56,7 +56,7 @@ def parameter_rows(calibration: Calibration) -> tuple[ParameterRow, ...]:
     """Return all estimated parameters."""
     if (joint := calibration.joint) is not None:
         rows = zip(joint.parameters, joint.values, joint.std, joint.std_before, strict=True)
-        return tuple(_make_row(*row) for row in rows)
+        return tuple(_row(*row) for row in rows)
     camera, window = calibration.camera, calibration.window
     known = calibration.std()
     std = {"f": known.fx_px, "fx": known.fx_px, "fy": known.fy_px, "cx": known.cx_px, "cy": known.cy_px}
@@ -64,16 +64,16 @@ def parameter_rows(calibration: Calibration) -> tuple[ParameterRow, ...]:
     values = {"f": camera.fx_px} if camera.fx_px == camera.fy_px else {"fx": camera.fx_px, "fy": camera.fy_px}
     values |= {"cx": camera.cx_px, "cy": camera.cy_px}
     values |= {name: value for name, value in camera.distortion.model_dump().items() if value}
-    rows = [_make_row(parse_parameter(name), value, std.get(name)) for name, value in values.items()]
+    rows = [_row(parse_parameter(name), value, std.get(name)) for name, value in values.items()]
     if window is not None:
-        rows.append(_make_row(WindowParameter.DISTANCE, window.distance_mm, known.window_distance_mm))
+        rows.append(_row(WindowParameter.DISTANCE, window.distance_mm, known.window_distance_mm))
         if window.refractions == 2:
-            rows.append(_make_row(WindowParameter.THICKNESS, window.thickness_mm))
-            rows.append(_make_row(WindowParameter.GLASS_INDEX, window.glass_index))
+            rows.append(_row(WindowParameter.THICKNESS, window.thickness_mm))
+            rows.append(_row(WindowParameter.GLASS_INDEX, window.glass_index))
     return tuple(rows)
 
 
-def _make_row(key: ParameterKey, value: float, std: float | None = None, before: float | None = None) -> ParameterRow:
+def _row(key: ParameterKey, value: float, std: float | None = None, before: float | None = None) -> ParameterRow:
     quantity = key.quantity
     return ParameterRow(
         name=key.text,
@@ -105,8 +105,22 @@ def read_certificate(path: str | Path) -> dict[str, JsonValue]:
 def check_certificate(path: str | Path, calibration: str | Path) -> list[str]:
     """Check a certificate's seal and that it belongs to a calibration file; return the problems found.
 
-    ``path`` is the certificate (JSON). A problem is a sentence; there is none if the certificate is genuine and belongs
-    to the file. CaptureError if a file cannot be read, or is not a certificate.
+    Parameters
+    ----------
+    path : str or Path
+        Certificate (JSON) to verify.
+    calibration : str or Path
+        The certified calibration file.
+
+    Returns
+    -------
+    list of str
+        Sentences about each problem; empty if the certificate is genuine and belongs to the file.
+
+    Raises
+    ------
+    CaptureError
+        A file cannot be read, or is not a certificate.
     """
     content, found = read_certificate(path), hash_file(calibration)
     against = []
