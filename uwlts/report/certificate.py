@@ -56,7 +56,7 @@ def parameter_rows(calibration: Calibration) -> tuple[ParameterRow, ...]:
     """Return all estimated parameters."""
     if (joint := calibration.joint) is not None:
         rows = zip(joint.parameters, joint.values, joint.std, joint.std_before, strict=True)
-        return tuple(_row(*row) for row in rows)
+        return tuple(_make_row(*row) for row in rows)
     camera, window = calibration.camera, calibration.window
     known = calibration.std()
     std = {"f": known.fx_px, "fx": known.fx_px, "fy": known.fy_px, "cx": known.cx_px, "cy": known.cy_px}
@@ -64,16 +64,16 @@ def parameter_rows(calibration: Calibration) -> tuple[ParameterRow, ...]:
     values = {"f": camera.fx_px} if camera.fx_px == camera.fy_px else {"fx": camera.fx_px, "fy": camera.fy_px}
     values |= {"cx": camera.cx_px, "cy": camera.cy_px}
     values |= {name: value for name, value in camera.distortion.model_dump().items() if value}
-    rows = [_row(parse_parameter(name), value, std.get(name)) for name, value in values.items()]
+    rows = [_make_row(parse_parameter(name), value, std.get(name)) for name, value in values.items()]
     if window is not None:
-        rows.append(_row(WindowParameter.DISTANCE, window.distance_mm, known.window_distance_mm))
+        rows.append(_make_row(WindowParameter.DISTANCE, window.distance_mm, known.window_distance_mm))
         if window.refractions == 2:
-            rows.append(_row(WindowParameter.THICKNESS, window.thickness_mm))
-            rows.append(_row(WindowParameter.GLASS_INDEX, window.glass_index))
+            rows.append(_make_row(WindowParameter.THICKNESS, window.thickness_mm))
+            rows.append(_make_row(WindowParameter.GLASS_INDEX, window.glass_index))
     return tuple(rows)
 
 
-def _row(key: ParameterKey, value: float, std: float | None = None, before: float | None = None) -> ParameterRow:
+def _make_row(key: ParameterKey, value: float, std: float | None = None, before: float | None = None) -> ParameterRow:
     quantity = key.quantity
     return ParameterRow(
         name=key.text,
