@@ -20,8 +20,8 @@ from twin.devices.grbl_controller import GrblController, StageState
 from twin.recording.render import AnyScene, choose_scene
 from twin.rendering_options import CPU, Options, Variant, use_variant
 from twin.scene.campaign import AnySensor, choose_sensors
-from twin.scene.description import replace_values
-from twin.scene.platforms import Light, Motion, Platform, Shot
+from twin.scene.description import AnyMotion, replace_values
+from twin.scene.platforms import Light, Motion, Shot
 from uwlts.errors import DescriptionError, DesignError
 from uwlts.model.sensor import Stage
 
@@ -118,7 +118,7 @@ class Track:
     start_mm: float
 
     @classmethod
-    def place(cls, stage: Stage, motion: Motion | Platform, *, start_mm: float | None = None) -> "Track":
+    def place(cls, stage: Stage, motion: AnyMotion, *, start_mm: float | None = None) -> "Track":
         """Place a motion at ``start_mm``, by default in the middle of the travel, rounded to a step.
 
         Raises DescriptionError if the motion is not one of the stage, or not within the travel.
