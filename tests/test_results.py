@@ -51,9 +51,9 @@ def test_each_table_has_one_study_and_each_study_its_code():
 
 
 def test_the_results_are_short():
-    """Pages of tables with a few sentences: 7,700 words beside the bars of the tables are the most."""
+    """Pages of tables with a few sentences: 7,800 words beside the bars of the tables are the most."""
     words = [word for page in PAGES if page.parent == FOLDER for word in page.read_text(encoding="utf-8").split()]
-    assert sum(word not in ("|", "---") for word in words) <= 7_700
+    assert sum(word not in ("|", "---") for word in words) <= 7_800
 
 
 @cache

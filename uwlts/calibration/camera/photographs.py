@@ -107,7 +107,8 @@ class CameraCalibration(Brief):
                 "left_out": {each.name: each.reason for each in self.photographs if each.reason is not None},
             },
         }
-        write_file(path, yaml.safe_dump(content, sort_keys=False, allow_unicode=True), overwrite=overwrite)
+        text: str = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+        write_file(path, text, overwrite=overwrite)
 
 
 def calibrate_camera(
