@@ -219,7 +219,7 @@ def _is_side(last: np.ndarray, before: np.ndarray, shape: tuple[int, ...]) -> bo
     beyond = (2.0 * last - before)[np.isfinite(last[:, 0]) & np.isfinite(before[:, 0])]
     rim = _Rule.ring_px + _Rule.rim_px
     inside = (beyond > rim) & (beyond < np.array(shape[::-1]) - 1 - rim)
-    return np.count_nonzero(inside.all(axis=1)) > 1
+    return bool(np.count_nonzero(inside.all(axis=1)) > 1)
 
 
 def _harmonics(grey: np.ndarray, pixels: np.ndarray, radius: float) -> np.ndarray:
