@@ -287,6 +287,7 @@ assert abs(spacing["joint"].error_mm) < 0.05
 """,
     ),
     "docs/tutorials/choose-a-design.md": Page(
+        not_run={"from live_drawing": "sliders need Jupyter; tests/twin/design/test_live_drawing.py draws the figures"},
         prepare={"twin sweep study.toml --out runs/study": study_of_the_page},
         again=("twin sweep study.toml --out runs/study --verify 2",),
         instead={"--verify 2": "--verify 1", "steps = 26": "steps = 6", "steps = 24": "steps = 5"}
