@@ -65,7 +65,7 @@ oldest: setup $(OLDEST)/.installed
 	@# They use what newer libraries below them call outdated.
 	@$(OLDEST)/bin/python -m pytest -q -n 2 --dist loadfile -W default::DeprecationWarning \
 		tests/test_documentation.py tests/system/test_documented_commands.py \
-		-k "test_documentation or README or api.md or calibrate-a-mount or large-clouds"
+		-k "test_documentation or README or api.md or large-clouds"
 
 check: style types
 	@$(PYTHON) -m pytest -q tests/test_licences.py tests/test_budget.py
