@@ -215,7 +215,8 @@ def orient_triangles(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     starts, ends = np.concatenate([one, one + many]), np.concatenate([other + many * turned, other + many * ~turned])
     part = connected_components(coo_array((np.ones(len(starts)), (starts, ends)), shape=(2 * many,) * 2))[1]
     one, two = (vertices[faces[:, k]] - vertices[faces[:, 0]] for k in (1, 2))
-    kept = np.bincount(part[:many], np.linalg.norm(np.cross(one, two), axis=1), minlength=part.max() + 1)
+    area = np.linalg.norm(np.cross(one, two), axis=1)
+    kept = np.bincount(part[:many], area, minlength=part.max() + 1)
     turn = kept[part[many:]] > kept[part[:many]]
     result = faces.copy()
     result[turn] = faces[turn][:, ::-1]
@@ -251,7 +252,8 @@ def select_seen_side(
     sure = np.bincount(part, clear)
     outwards = np.bincount(part, clear * (sign > 0))
     both = np.minimum(outwards, sure - outwards) > _BOTH * sure
-    keeps = np.where(both[part], 1, np.where(np.bincount(part, sign) >= 0, 1, -1)[part] * sign)
+    side = np.where(np.bincount(part, sign) >= 0, 1, -1)
+    keeps = np.where(both[part], 1, side[part] * sign)
     nearby, place = KDTree(places).query(samples, workers=-1)
     seen = np.einsum("mi,mi->m", normals, keeps[place, None] * facing[place]) > 0
     # With both sides, the nearest place of a sample may be on the other one.

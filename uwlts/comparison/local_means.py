@@ -144,7 +144,8 @@ def _propagate_variance(
     group, owner = _place_images(place, image)
     result = np.zeros(size)
     for part in known.image_errors_mm():
-        together = np.bincount(owner, np.einsum("ni,ni->n", part[point], normal) / many[place])
+        moved = np.einsum("ni,ni->n", part[point], normal)
+        together = np.bincount(owner, moved / many[place])
         result += np.bincount(group, together**2, minlength=size)
     moves = np.zeros((size, len(known.patterns_mm)))
     for number_of, pattern in enumerate(known.patterns_mm):

@@ -148,7 +148,8 @@ def _make_series_matrix(count: int) -> np.ndarray:
 
 def _count_needed_terms(size: np.ndarray, tolerance: float | np.ndarray) -> int:
     """Return the number of leading terms, at least 1, after which sizes (T, K) sum to no more than the tolerance."""
-    return max(1, int(np.count_nonzero((np.cumsum(size[::-1], axis=0)[::-1] > tolerance).any(axis=1))))
+    left = np.cumsum(size[::-1], axis=0)[::-1]
+    return max(1, int(np.count_nonzero((left > tolerance).any(axis=1))))
 
 
 @compiled

@@ -305,7 +305,8 @@ def _measure_variance(images: np.ndarray) -> np.ndarray:
     cell = np.digitize(above, np.geomspace(2.0, max(float(above.max()), 4.0), _BINS))
     most = np.array([np.median(variance[cell == k]) if (cell == k).any() else 0.0 for k in range(_BINS + 1)])
     most = np.maximum(most, _ROUNDING) * limit / float(chi2.median(freedom))
-    return np.where(variance <= most[cell], variance * _STILL / float(chi2.cdf(limit, freedom + 2)), np.nan)
+    kept = variance <= most[cell]
+    return np.where(kept, variance * _STILL / float(chi2.cdf(limit, freedom + 2)), np.nan)
 
 
 def _find_repeats(capture: Capture) -> list[np.ndarray]:
@@ -337,7 +338,8 @@ def _judge_transfer(counted: np.ndarray, background_dn: float, gain: float, dark
     A variance with f degrees of freedom has the relative standard deviation sqrt(2 / f).
     """
     count, means, variances = counted[:, counted[0] > _FEWEST_PIXELS]
-    rest = variances / count / np.maximum(gain * (means / count - background_dn) + dark + _ROUNDING, 1e-3) - 1
+    expected = np.maximum(gain * (means / count - background_dn) + dark + _ROUNDING, 1e-3)
+    rest = variances / count / expected - 1
     misfit = math.sqrt(np.sum(rest**2 / (2 / (freedom * count) + _TRANSFER_MISFIT**2)) / (len(rest) - 2))
     largest = 100 * float(np.abs(rest).max())
     return PartFit(

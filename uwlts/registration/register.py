@@ -410,7 +410,8 @@ def _closure_rms(
         return None
     pair = pairs[key]
     left = (pair.residuals + pair.derivatives @ without.step)[pair.counted]
-    return float(np.sqrt(max(np.mean(left**2) - np.mean((pair.std * pair.spread)[pair.counted] ** 2), 0.0)))
+    noise = (pair.std * pair.spread)[pair.counted]
+    return float(np.sqrt(max(np.mean(left**2) - np.mean(noise**2), 0.0)))
 
 
 def _check_poses(poses: np.ndarray | None, count: int) -> np.ndarray:

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from twin.scene.forms import Flange, Seabed
 from twin.scene.forms.parts import flange_face
 from twin.scene.forms.seabed import _sediment_height
-from twin.scene.forms.triangles import add_relief, bowed_plate, rounded_box
+from twin.scene.forms.triangles import add_relief, bowed_plate, rounded_box, tube
 from twin.scene.scene_object import FreeForm
 from twin.scene.surfaces import FinishProperties
 
@@ -155,6 +155,22 @@ def test_heights_of_a_relief_have_the_described_spectrum(hurst):
     expected = [1.0, *(power @ (1 - np.sinc(number * each / math.pi)) / power.sum() for each in lag)]
     # Two plates of 20 x 20 patches have the variance to 5 %, by waves of several patches to 10 %: three of these.
     np.testing.assert_allclose(np.mean(found, axis=0), 0.04 * np.array(expected), rtol=0.3)
+
+
+def test_slender_facets_of_a_relief_become_compact_ones():
+    """A pipe of strips has as many vertices as other surfaces of its area; quarters of its triangles: 2.4 million."""
+    around = np.linspace(0, 2 * np.pi, 360, endpoint=False)
+    pipe = tube(np.array([-90.0, 90.0]), around, np.full((2, 360), 30.0))
+    own = FinishProperties("diffuse", relief_mm=1e-9, relief_length_mm=5.0)
+    vertices, faces = add_relief(pipe, own, np.random.default_rng(1))
+    whole = trimesh.Trimesh(vertices, faces, process=False)
+    assert 50_000 < len(vertices) < 300_000
+    assert whole.area == pytest.approx(trimesh.Trimesh(*pipe, process=False).area, rel=1e-6)
+    # A pipe with open ends: 360 edges at each end have one face, the others two.
+    sides = np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)), axis=0, return_counts=True)[1]
+    assert sorted(set(sides.tolist())) == [1, 2] and np.count_nonzero(sides == 1) == 720
+    lengths = np.linalg.norm(np.diff(vertices[faces[:, [0, 1, 2, 0]]], axis=1), axis=2)
+    assert lengths.max() < 2 * np.sqrt(whole.area / 150_000) + 1e-6
 
 
 def test_a_relief_follows_normals_and_closes_its_surface():

@@ -204,14 +204,15 @@ def _split_edges(values: np.ndarray, faces: np.ndarray, longest: float) -> tuple
         cells += (ab, b, bc), (a, ab, bc, c)
         a, b, c, ab, bc, ca = corners[count == 3].T
         cells += (a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)
-        corners, here, there = np.hstack([strips, of_strips]), of_strips[:, 0] >= 0, of_strips[:, 2] >= 0
-        a, b, c, d, ab, _, cd, _ = corners[here & there].T
-        cells += (a, ab, cd, d), (ab, b, c, cd)
-        a, b, c, d, ab, _, cd, _ = corners[here & ~there].T
-        cells += (a, ab, d), (ab, b, c), (ab, c, d)
-        a, b, c, d, ab, _, cd, _ = corners[~here & there].T
-        cells += (a, b, cd), (b, c, cd), (a, cd, d)
-        a, b, c, d, ab, _, cd, _ = corners[~here & ~there].T
+        # If one of a strip's sides is long, it comes first.
+        order = (np.arange(4) + 2 * (of_strips[:, :1] < 0)) % 4
+        corners = np.hstack([np.take_along_axis(each, order, axis=1) for each in (strips, of_strips)])
+        count = np.sum(of_strips >= 0, axis=1)
+        a, b, c, d, *_ = corners[count == 0].T
         cells += (a, b, c), (a, c, d)
+        a, b, c, d, ab, *_ = corners[count == 1].T
+        cells += (a, ab, d), (ab, b, c), (ab, c, d)
+        a, b, c, d, ab, _, cd, _ = corners[count == 2].T
+        cells += (a, ab, cd, d), (ab, b, c, cd)
         faces, strips = (np.concatenate([np.stack(each, 1) for each in cells if len(each) == k]) for k in (3, 4))
     return values, np.concatenate(done)

@@ -193,7 +193,8 @@ def mean_squares(held: HeldOut, noise: dict[str, Noise]) -> np.ndarray:
             continue
         sigma = np.array([noise[kind].sigma_px for kind in kinds])
         weight = np.array([noise[kind].sigma_px / noise[kind].effective_px() for kind in kinds]) ** 2
-        found.append(float(np.sum(weight * np.minimum(np.square(values / sigma), _CLIPPED**2)) / np.sum(weight)))
+        squares = np.minimum(np.square(values / sigma), _CLIPPED**2)
+        found.append(float(np.sum(weight * squares) / np.sum(weight)))
     return np.array(found)
 
 

@@ -144,7 +144,8 @@ def _misfit(
 ) -> float:
     """Return the median distance over the poses between the sphere's centre and its position from the profile."""
     seen = (_rotate_back(rotations, state.artefact[:3] - positions) - state.translation) @ state.rotation
-    return float(np.median(np.hypot(np.hypot(*(seen[:, [0, 2]] - centres).T), np.abs(seen[:, 1]) - depth)))
+    off = np.hypot(*(seen[:, [0, 2]] - centres).T)
+    return float(np.median(np.hypot(off, np.abs(seen[:, 1]) - depth)))
 
 
 def _start_of_plane(

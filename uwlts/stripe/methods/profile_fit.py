@@ -430,6 +430,7 @@ def _select_runs(count: int) -> np.ndarray:
 @lru_cache
 def _residual_weights(reach: int) -> np.ndarray:
     """Return weights (2 R + 1,) of centres that give the middle one's distance from their least-squares parabola."""
-    weights = -np.linalg.pinv(np.vander(np.arange(-reach, reach + 1, dtype=float), 3))[-1]
+    powers = np.vander(np.arange(-reach, reach + 1, dtype=float), 3)
+    weights = -np.linalg.pinv(powers)[-1]
     weights[reach] += 1.0
     return weights
