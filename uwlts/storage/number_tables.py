@@ -43,7 +43,7 @@ _UNITS_OF = (
     {"time_s": _TIMES}
     | dict.fromkeys(_DIRECTIONS, _LENGTHS)
     | dict.fromkeys("xyz", _LENGTHS)
-    | dict.fromkeys(ROTATION_NAMES[4:], _ANGLES)
+    | dict.fromkeys((*ROTATION_NAMES[4:], "phi", "theta", "psi", "omega", "kappa"), _ANGLES)
 )
 """Units of the columns whose units are converted or checked."""
 _SAME_NAMES = {name: name for name in (*ROTATION_NAMES, *_DIRECTIONS)} | _HEIGHTS
@@ -257,6 +257,13 @@ def _names_and_units(cells: list[str], path: Path) -> tuple[list[str], dict[str,
 def _name_axes(names: list[str], path: Path) -> tuple[list[str], tuple[str, ...]]:
     """Return names with x, y and z for three directions, and these; DescriptionError for a left-handed frame."""
     found = tuple(name for name in names if name in _DIRECTIONS)
+    if "x" not in names and {"lat", "latitude"} & {*names}:
+        raise DescriptionError(f"{path} has latitudes, which are angles: convert positions to lengths, such as UTM")
+    if found == ("down",) and {"x", "y"} <= {*names} and "z" not in names:
+        raise DescriptionError(
+            f"{path} has x, y and a depth, which points down: if x is north and y east, name them so; "
+            "else change the depth's sign and name it up"
+        )
     if len(found) != 3 or not np.linalg.det([_DIRECTIONS[name] for name in found]):
         return names, ()
     if np.linalg.det([_DIRECTIONS[name] for name in found]) < 0:
@@ -268,8 +275,13 @@ def _name_axes(names: list[str], path: Path) -> tuple[list[str], tuple[str, ...]
 
 
 def _spell_directions(names: list[str]) -> list[str]:
-    """Return names with three directions that are letters, such as n, e and d, in full."""
-    return [_LETTERS.get(name, name) for name in names] if len(_LETTERS.keys() & names) == 3 else names
+    """Return three letters of directions, such as n, e and d, in full; up beside x and y as z, and z as up else."""
+    same = _LETTERS if len(_LETTERS.keys() & names) == 3 else {}
+    if {"x", "y"} <= {*names}:
+        same = {} if "z" in names else {"up": "z"}
+    elif len(_DIRECTIONS.keys() & names) == 2:
+        same = {"z": "up"}
+    return [same.get(name, name) for name in names]
 
 
 def _is_unit_row(line: bytes) -> bool:

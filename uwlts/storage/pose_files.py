@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
 from uwlts.errors import DescriptionError
@@ -24,6 +25,12 @@ FARTHEST_MM = 1e7
 """Ten kilometres: no platform reaches farther, and squares of larger numbers would lose the noise."""
 
 _COMPASS = ("north", "east", "down")
+_SAME_ANGLES = (
+    {"heading": "yaw"},
+    {"phi": "roll", "theta": "pitch", "psi": "yaw"},
+    {"omega": "roll", "phi": "pitch", "kappa": "yaw"},
+)
+"""Names of angles on compasses, in navigation and in photogrammetry."""
 _ROUNDED = 2e-3
 """Deviation from a rigid matrix or a unit quaternion when numbers have three decimals."""
 _FORMAT = re.compile(
@@ -36,6 +43,9 @@ _LAGS = (2, 3, 4)  # two sources in turn, or one with two or three times the rat
 _FEWEST_POSES, _ALTERNATING, _RETURNED, _LEAST_JUMP_MM, _REACH_MM = 10, 0.2, 0.3, 0.1, 300.0
 """Two sources: least number of poses, share that jumps, largest distance after it relative to the jump, smallest jump,
 and lever of rotations. Of independent noise along one axis, 17 % jump, in a plane 9 %."""
+_AROUND, _LONG, _LIKE_LONGEST, _FEWEST_LONG, _OFTEN, _BACK = 9, 6.0, 0.6, 4, 0.02, 0.8
+"""Two sources in bursts: poses around with a common motion, least jump relative to the median and longest steps without
+it, least number of jumps and share of the poses, and share of the jumps that the next one takes back."""
 _NEAR_HALF_TURN = 3.0
 """Angles in rad reach pi, unless turns are small; the largest in deg is between 3 and pi by chance only."""
 _METRES = np.array([1e3] * 3 + [1.0] * 3)
@@ -180,7 +190,16 @@ def _find_alternation(poses: np.ndarray) -> list[str]:
         found[lag - 1 : 1 - lag] |= smooth < _RETURNED * np.where(bent > 2 * _LEAST_JUMP_MM, bent, 0)[lag - 1 : 1 - lag]
     jumps = max(every, key=np.mean)
     if np.mean(jumps) < _ALTERNATING:
-        return []
+        # Bursts of two sources: each long move, apart from the motion of all, is taken back by the next one.
+        moves = np.diff(places, axis=0)
+        moves -= median_filter(moves, (_AROUND, 1))
+        sizes = np.linalg.norm(moves, axis=1)
+        middle, longest = np.quantile(sizes, (0.5, 1 - _OFTEN))
+        long = np.flatnonzero(sizes > max(_LONG * middle, _LIKE_LONGEST * longest, _LEAST_JUMP_MM))
+        back = np.linalg.norm(moves[long[1:]] + moves[long[:-1]], axis=1) < _RETURNED * sizes[long[1:]]
+        if len(long) < max(_FEWEST_LONG, _OFTEN * len(poses)) or np.mean(back) < _BACK:
+            return []
+        jumps = np.isin(np.arange(len(poses) - 2), long)
     changes = (np.linalg.norm(np.diff(poses[:, :3, column], axis=0), axis=1)[:-1][jumps] for column in (0, 3))
     turned, moved = map(np.median, changes)
     return [
@@ -197,17 +216,21 @@ def _poses(table: NumberTable, pose_format: PoseFormat, unit: Unit | None) -> tu
     if (numbers := columns.pop("pose", None)) is not None:
         log_warnings(path, _number_gaps(numbers, path))
     units = table.units
-    if "heading" in columns:
-        if table.directions != _COMPASS:
-            raise DescriptionError(
-                f"{path} has a heading, clockwise from north, a yaw only for {', '.join(_COMPASS)} as x, y, z: "
-                "name positions so, or convert it (for east, north, up: yaw = 90 deg - heading) and name it yaw"
-            )
-        columns, units = ({("yaw" if n == "heading" else n): each for n, each in d.items()} for d in (columns, units))
+    if "heading" in columns and table.directions != _COMPASS:
+        raise DescriptionError(
+            f"{path} has a heading, clockwise from north, a yaw only for {', '.join(_COMPASS)} as x, y, z: "
+            "name positions so, or convert it (for east, north, up: yaw = 90 deg - heading) and name it yaw"
+        )
+    axes = (known["axes"] or "") if (known := _FORMAT.fullmatch(pose_format)) else ""
+    same = next((each for each in _SAME_ANGLES if each.keys() <= columns.keys()), {})
+    if len(set(axes.lower())) != 2:  # proper Euler angles, such as ZXZ, have no roll
+        columns, units = ({same.get(name, name): each for name, each in d.items()} for d in (columns, units))
     names = _order_names([*columns], pose_format, path)
-    for name in names:
+    if axes and any(name not in ROTATION_NAMES and not name.isdigit() for name in names[3:]):
+        log_warnings(path, [f"{', '.join(names[3:])} are read as angles about {', '.join(axes)}, in this order"])
+    for name in names if axes else ROTATION_NAMES:
         stated = units.get(name, "")
-        if name in ROTATION_NAMES and stated and stated != pose_format.rpartition("-")[2]:
+        if name not in {*"xyz"} and stated and stated != pose_format.rpartition("-")[2]:
             raise DescriptionError(
                 f"{path} has {name} in {stated}, but the format is {pose_format}: choose a format that ends "
                 "with the angles' unit, -deg or -rad"
@@ -254,13 +277,14 @@ def _order_names(names: list[str], pose_format: PoseFormat, path: Path) -> list[
             f"{path} has the columns {', '.join(names)}, but the format is {pose_format}: choose the format "
             "that the names describe"
         )
-    found: list[str] = [axis for axis in "xyz" if axis in names]
-    if len(found) < 3 or named is None or len(names) != len(found) + len(kinds[named]):
-        if [name for name in names[:3] if name in found] != found:
-            raise DescriptionError(
-                f"{path} has the columns {', '.join(names)}: expected x, y and z first, or names of all columns, such "
-                "as qw, qx, qy, qz"
-            )
+    found = [name for name in names if named is None or name not in kinds[named]]
+    found = [*"xyz"] if {*"xyz"} == {*found} else found
+    if any(name in {*"xyz"} and name != "xyz"[number : number + 1] for number, name in enumerate(found)):
+        raise DescriptionError(
+            f"{path} has the columns {', '.join(names)}: expected x, y and z first, or names of all columns, such as "
+            "qw, qx, qy, qz"
+        )
+    if named is None or len(found) != (0 if named == "angle" else 3):
         return names
     match named:
         case "quaternion":
