@@ -25,15 +25,11 @@ _LENGTHS = {"nm": 1e-6, "um": 1e-3, "mm": 1.0, "cm": 10.0, "dm": 100.0, "m": 1e3
 _LENGTHS |= {"in": 25.4, "ft": 304.8, "yd": 914.4}
 _ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "gon": np.pi / 200}
 _TIMES = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
-_SAME_UNITS = {"degree": "deg", "°": "deg", "radian": "rad", "grad": "gon", "second": "s", '"': "in", "foot": "ft"}
-_SAME_UNITS |= {
-    f"{name}{ending}": unit
-    for prefix, unit in (("", "m"), ("milli", "mm"), ("centi", "cm"), ("micro", "um"), ("kilo", "km"))
-    for name in (f"{prefix}metre", f"{prefix}meter")
-    for ending in ("", "s")
-}
-_SAME_UNITS |= {f"{name}s": unit for name, unit in _SAME_UNITS.items() if name in ("degree", "radian", "second")}
-_SAME_UNITS |= {"microns": "um", "micron": "um", "inches": "in", "inch": "in", "feet": "ft"}
+_SAME_UNITS = {"degree": "deg", "°": "deg", "radian": "rad", "grad": "gon", "second": "s", "micron": "um"}
+_SAME_UNITS |= {'"': "in", "inch": "in", "inche": "in", "foot": "ft", "feet": "ft"}
+_PREFIXES = {"": "m", "milli": "mm", "centi": "cm", "micro": "um", "kilo": "km"}
+_SAME_UNITS |= {f"{prefix}met{end}": unit for prefix, unit in _PREFIXES.items() for end in ("re", "er")}
+"""Units by their names in the singular, of which a plural has an s more."""
 _UNITS = _LENGTHS | _ANGLES | _TIMES
 _DIRECTIONS = {"east": (1, 0, 0), "north": (0, 1, 0), "up": (0, 0, 1)}
 _DIRECTIONS |= {"west": (-1, 0, 0), "south": (0, -1, 0), "down": (0, 0, -1)}
@@ -41,8 +37,7 @@ _HEIGHTS = {"height": "up", "altitude": "up", "alt": "up", "elevation": "up", "d
 _LETTERS = {name[0]: name for name in ("east", "north", "up", "down")}
 _UNITS_OF = (
     {"time_s": _TIMES}
-    | dict.fromkeys(_DIRECTIONS, _LENGTHS)
-    | dict.fromkeys("xyz", _LENGTHS)
+    | dict.fromkeys((*"xyz", *_DIRECTIONS), _LENGTHS)
     | dict.fromkeys((*ROTATION_NAMES[4:], "phi", "theta", "psi", "omega", "kappa"), _ANGLES)
 )
 """Units of the columns whose units are converted or checked."""
@@ -256,20 +251,17 @@ def _names_and_units(cells: list[str], path: Path) -> tuple[list[str], dict[str,
 
 def _name_axes(names: list[str], path: Path) -> tuple[list[str], tuple[str, ...]]:
     """Return names with x, y and z for three directions, and these; DescriptionError for a left-handed frame."""
-    found = tuple(name for name in names if name in _DIRECTIONS)
     if "x" not in names and {"lat", "latitude"} & {*names}:
         raise DescriptionError(f"{path} has latitudes, which are angles: convert positions to lengths, such as UTM")
-    if found == ("down",) and {"x", "y"} <= {*names} and "z" not in names:
-        raise DescriptionError(
-            f"{path} has x, y and a depth, which points down: if x is north and y east, name them so; "
-            "else change the depth's sign and name it up"
-        )
-    if len(found) != 3 or not np.linalg.det([_DIRECTIONS[name] for name in found]):
+    known = _DIRECTIONS if "z" in names else _DIRECTIONS | {"x": _DIRECTIONS["east"], "y": _DIRECTIONS["north"]}
+    found = tuple(name for name in names if name in known)
+    if len(found) != 3 or not (volume := np.linalg.det([known[name] for name in found])):
         return names, ()
-    if np.linalg.det([_DIRECTIONS[name] for name in found]) < 0:
+    if volume < 0 or "x" in found:
+        other = ", or name x and y north and east if they are" if "x" in found else ""
         raise DescriptionError(
             f"{path} has the axes {', '.join(found)}, a left-handed frame that mirrors all shapes: exchange the first "
-            "two, or change the sign of the last"
+            f"two, or change the sign of the last{other}"
         )
     return [dict(zip(found, "xyz", strict=True)).get(name, name) for name in names], found
 
@@ -420,7 +412,7 @@ def _split_unit(cell: str) -> tuple[str, str | None]:
 
 def _plain_unit(unit: str) -> str:
     unit = unit.strip().replace("µ", "u").replace("μ", "u")
-    return _SAME_UNITS.get(unit, unit)
+    return _SAME_UNITS.get(unit.removesuffix("s") if len(unit) > len("sec") else unit, unit)
 
 
 def _normalise_name(name: str) -> str:

@@ -170,7 +170,7 @@ def test_radians_read_as_degrees_are_doubted(tmp_path: Path, caplog: pytest.LogC
         ("x,y,z,roll,pitch,yaw", "rotvec-deg", None, "the format that the names describe"),
         ("x,y,z,roll,pitch,yaw", "euler-zyz-deg", None, "twice about one axis"),
         ("a,b,c,x,y,z", "rotvec-rad", None, "x, y and z first"),
-        ("x,y,depth,roll,pitch,yaw", "euler-zyx-deg", None, "a depth, which points down"),
+        ("x,y,depth,roll,pitch,yaw", "euler-zyx-deg", None, "axes x, y, down, a left-handed frame .* if they are"),
         ("x,y,z,psi_rad,theta_rad,phi_rad", "euler-zyx-deg", None, "in rad, but"),
     ],
 )
