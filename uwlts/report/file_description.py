@@ -128,7 +128,7 @@ _DESCRIPTIONS = (
     ("target", ({"kind", "columns", "rows"},), "uwlts import and uwlts camera --target"),
     ("order of a report", ({"datum"}, {"client"}, {"limits"}), "uwlts findings-report --order"),
 )
-"""Kinds of descriptions, keys by any of which they are recognised in this order, and the command that uses them."""
+"""Kinds of descriptions in the order of recognition, alternative keys, and the command that uses them."""
 
 
 def describe(path: str | Path, *, unit: Unit | None = None, pose_format: PoseFormat = SAVED_FORMAT) -> str:

@@ -29,7 +29,7 @@ _SAME_UNITS = {"degree": "deg", "°": "deg", "radian": "rad", "grad": "gon", "se
 _SAME_UNITS |= {'"': "in", "inch": "in", "inche": "in", "foot": "ft", "feet": "ft"}
 _PREFIXES = {"": "m", "milli": "mm", "centi": "cm", "micro": "um", "kilo": "km"}
 _SAME_UNITS |= {f"{prefix}met{end}": unit for prefix, unit in _PREFIXES.items() for end in ("re", "er")}
-"""Units by their names in the singular, of which a plural has an s more."""
+"""Units by their names in the singular."""
 _UNITS = _LENGTHS | _ANGLES | _TIMES
 _DIRECTIONS = {"east": (1, 0, 0), "north": (0, 1, 0), "up": (0, 0, 1)}
 _DIRECTIONS |= {"west": (-1, 0, 0), "south": (0, -1, 0), "down": (0, 0, -1)}
