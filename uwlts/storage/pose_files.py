@@ -43,8 +43,8 @@ _FEWEST_POSES, _ALTERNATING, _RETURNED, _LEAST_JUMP_MM, _REACH_MM = 10, 0.2, 0.3
 """Two sources: least number of poses, share that jumps, largest rest of a jump after it, smallest jump, and lever of
 rotations. Of independent noise along one axis, 15 % jump, in a plane 5 %."""
 _AROUND, _SAME, _LONG, _LIKE_LONGEST, _FEWEST_LONG, _OFTEN, _BACK = 9, 0.3, 6.0, 0.6, 4, 0.02, 0.8
-"""Two sources in bursts: number of poses with a common motion, and quantile of the steps without it. Least jump relative
-to this and to the longest steps, least number of jumps, their least share of the poses, and that taken back next."""
+"""Two sources in bursts: number of poses with a common motion, and quantile of the steps without it. Least jump
+relative to this and to the longest steps, least number of jumps, and least shares of the poses and of jumps back."""
 _NEAR_HALF_TURN = 3.0
 """Angles in rad reach pi, unless turns are small; the largest in deg is between 3 and pi by chance only."""
 _METRES = np.array([1e3] * 3 + [1.0] * 3)
