@@ -70,19 +70,15 @@ def _fill_contrasts(
     """
     (high, low), count = buffers, profiles.shape[0]
     for number in range(high.shape[0] + 2):
-        first = number * block
-        middle = first + min(block, count - first) // 2
-        for n in range(first, min(first + block, count)):
-            pixels, largest, least = profiles[n], high[number], low[number]
-            if n == first:
-                for k in range(pixels.size):
-                    largest[k] = least[k] = pixels[k]
-            elif n == middle:
-                for k in range(pixels.size):
-                    largest[k], least[k] = max(largest[k], pixels[k]), min(least[k], pixels[k])
-            else:
-                for k in range(pixels.size):
-                    largest[k] = max(largest[k], pixels[k])
+        first, end = number * block, min(number * block + block, count)
+        for n in range(first, end):
+            pixels, largest = profiles[n], high[number]
+            for k in range(pixels.size):
+                largest[k] = pixels[k] if n == first else max(largest[k], pixels[k])
+        if first < end:
+            start, middle, least = profiles[first], profiles[(first + end) // 2], low[number]
+            for k in range(least.size):
+                least[k] = min(start[k], middle[k])
         # The blocks on both sides of the block before the previous one are known by now.
         done, last = number - 2, high.shape[0] - 1
         if done >= 0:
@@ -417,8 +413,8 @@ class _SearchedImage:
         """
         lines = np.flatnonzero(self.several | self.wide)
         known = (self.stripe.status[lines] != _OK) | self.wide[lines]
-        lines = lines[mark_rivals(self.profiles, self.left, lines, known, self.rules)]
-        found = self.find_candidates(lines, rivals=True) if len(lines) else None
+        mark_rivals(self.profiles, self.left, lines, self.rules, known)
+        found = self.find_candidates(lines[known], rivals=True) if known.any() else None
         return found if found is not None and len(found.line) else None
 
     def find_candidates(self, lines: np.ndarray, *, rivals: bool = False) -> StripeCandidates:

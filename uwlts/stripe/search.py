@@ -138,16 +138,14 @@ def search_all(
 
 
 def mark_rivals(
-    profiles: np.ndarray, left: np.ndarray, lines: np.ndarray, known: np.ndarray, rules: SearchRules
-) -> np.ndarray:
-    """Return a mask (M,) of the profile lines ``lines`` (M,) that have a block of high contrast left.
+    profiles: np.ndarray, left: np.ndarray, lines: np.ndarray, rules: SearchRules, found: np.ndarray
+) -> None:
+    """Mark the profile lines ``lines`` (M,) in ``found`` (M,) that have a block of high contrast left.
 
     ``left`` (L, B + 2 `MARGIN`) contains the contrasts of the remaining blocks of all lines of the profiles (N, L);
-    spikes are ignored. Lines that are ``known`` (M,) are marked already and not examined.
+    spikes are ignored. Lines that are marked already are not examined.
     """
-    found = known.copy()
     _mark_rivals(profiles, left, lines, np.empty(rules.block + 2, np.float32), rules, found)
-    return found
 
 
 @compiled
@@ -368,15 +366,10 @@ def _choose_block(blocks: np.ndarray, highest: np.number, least: np.float32, rul
         return -1
     if rules.order == STRONGEST:
         return _find_first_equal(blocks, highest)
-    chosen = 0
     wanted = max(least, np.float32(highest) * np.float32(rules.share * _RULE.coarse_slack))
-    if rules.order == FIRST:
-        while blocks[chosen] < wanted:
-            chosen += 1
-        return chosen
-    chosen = blocks.size - 1
+    chosen = 0 if rules.order == FIRST else blocks.size - 1
     while blocks[chosen] < wanted:
-        chosen -= 1
+        chosen += 1 if rules.order == FIRST else -1
     return chosen
 
 
