@@ -19,7 +19,8 @@ import numpy as np
 from cyclopts import App
 
 import uwlts
-from tests.uwlts.desk.test_scan_service import joint_calibration, plan_for, write_images
+from tests.uwlts.desk.test_scan_service import plan_for, write_images
+from tests.uwlts.joint_views import joint_calibration
 from tests.uwlts.storage.test_point_cloud2 import rows
 from twin.devices.grbl_controller import GrblController
 from uwlts.model.library import load_sensor

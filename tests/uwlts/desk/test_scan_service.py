@@ -13,13 +13,10 @@ import numpy as np
 import pytest
 
 import uwlts
-from tests.uwlts.calibration_views import built_sensor
-from tests.uwlts.joint_views import MEDIUM, Noise, gathered, target_series
+from tests.uwlts.joint_views import MEDIUM, joint_calibration
 from tests.uwlts.recalibration.test_recalibration import SENSOR, SHIFTED, WATER, campaign, write_capture
 from tests.waiting import within
 from twin.devices.grbl_controller import GrblController
-from uwlts.calibration.calibrate import solve_jointly
-from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.desk import scan
 from uwlts.desk.scan import PassAdvice, ScanDevices, ScanService
 from uwlts.errors import CalibrationError, DescriptionError, HardwareError
@@ -35,13 +32,6 @@ from uwlts.storage.cloud import PointCloud
 
 EVERY_S = 0.15
 LASER_ON = (True, True, False, True)
-
-
-def joint_calibration(sensor: Sensor) -> Calibration:
-    noise = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(4))
-    series = target_series(built_sensor(), medium=0, positions=np.arange(6) * 36.0 - 120.0, noise=noise)
-    options = CalibrationOptions(poses="stage", correct_circles=False)
-    return solve_jointly(gathered(sensor, [series]), options=options).calibration
 
 
 @pytest.fixture(scope="module")
