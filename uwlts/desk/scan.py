@@ -249,7 +249,7 @@ class ScanDevices(NamedTuple):
 
 @dataclass
 class ServiceState:
-    """State of a scan in words, ``level`` "ok", "warning" or "error", and laser images and points published."""
+    """State of a scan as text, ``level`` "ok", "warning" or "error", and laser images and points published."""
 
     message: str
     level: Literal["ok", "warning", "error"] = "ok"
