@@ -88,7 +88,7 @@ def test_tangential_distortion_that_is_not_needed_is_known_to_be_small():
         return calibrate_lens(images, width_px=WIDTH, height_px=HEIGHT, choice=LensChoice(distortion, "square", std))
 
     auto, none, free = found("auto", 5e-4), found(("k1", "k2"), 5e-4), found(("k1", "k2", "p1", "p2"), 5e-4)
-    assert auto.name == "k1 k2, square pixels" and {"p1", "p2"} <= auto.std().keys() and "p1" not in none.std()
+    assert auto.options.name == "k1 k2, square pixels" and {"p1", "p2"} <= auto.std().keys() and "p1" not in none.std()
     # Prior knowledge makes them more certain than from images alone, and zero is not known exactly.
     for name in ("p1", "p2"):
         assert auto.std()[name] < min(5e-4, free.std()[name])
