@@ -67,6 +67,8 @@ class Flaws:
 
     glare: float = _flaw(off=0.0, typical=0.02, least=0.0, most=0.5)
     """Fraction of an image's light that lens and window spread over it: veiling glare (ISO 9358)."""
+    ghost: float = _flaw(off=0.0, typical=0.003, least=0.0, most=0.1)
+    """Fraction of an image's light in a blurred image of it, mirrored at the lens's axis by two of its surfaces."""
     vignetting: float = _flaw(off=0.0, typical=0.4, least=0.0, most=0.99)
     """Relative loss of light at the image's farthest corner, in addition to the cosine-fourth law."""
     uneven_lamp: float = _flaw(off=0.0, typical=0.6, least=0.0, most=0.99)
@@ -93,6 +95,8 @@ class Flaws:
     """Increment of the tangential distortion p1 of the lens as built."""
     rolling_shutter: float = _flaw(off=0.0, typical=10.0, least=0.0, most=1000.0)
     """Delay in us between rows of a rolling shutter; visible while the stage moves."""
+    row_noise: float = _flaw(off=0.0, typical=5.0, least=0.0, most=1000.0)
+    """Standard deviation in electrons of an offset that all pixels of a row share, drawn anew for each image."""
     jpeg: int = _flaw(off=0, typical=90, least=1, most=100)
     """Quality of JPEG compression; 8-bit images only."""
     colour_filter: bool = False
