@@ -68,7 +68,7 @@ class Flaws:
     glare: float = _flaw(off=0.0, typical=0.02, least=0.0, most=0.5)
     """Fraction of an image's light that lens and window spread over it: veiling glare (ISO 9358)."""
     ghost: float = _flaw(off=0.0, typical=0.003, least=0.0, most=0.1)
-    """Fraction of an image's light in a blurred image of it, mirrored at the lens's axis by two of its surfaces."""
+    """Fraction of an image's light that image sensor and lens reflect to a blurred image, mirrored at the axis."""
     vignetting: float = _flaw(off=0.0, typical=0.4, least=0.0, most=0.99)
     """Relative loss of light at the image's farthest corner, in addition to the cosine-fourth law."""
     uneven_lamp: float = _flaw(off=0.0, typical=0.6, least=0.0, most=0.99)

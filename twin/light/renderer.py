@@ -128,10 +128,10 @@ class SurfaceLight:
             lit = light.reaches(self.objects.scene, end, here, after_s, bright)
             towards = segment.si.to_local(pose.direction(-here.direction, after_s))
             for context, value, of_main in parts:
-                sent = dr.select(lit, bsdf.eval(context, segment.si, towards, lit)[0], 0.0)
-                total += sent * value
+                sent = bsdf.eval(context, segment.si, towards, lit)[0]
+                total += dr.select(lit, sent * value, 0.0)
                 if light is sources[0]:
-                    main += sent * of_main
+                    main += dr.select(lit, sent * of_main, 0.0)
         passed = dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, 0.0))
         return total * passed, main * passed
 

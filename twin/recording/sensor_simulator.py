@@ -361,9 +361,15 @@ class SensorSimulator:
     def detect(self, electrons: np.ndarray, *, exposure_ms: float, noise_seed: list[int]) -> np.ndarray:
         """Return grey values (H, W) for mean photo-electrons (H, W), with seeded noise if noise is enabled."""
         rng = np.random.default_rng(noise_seed) if self.options.effects.noise else None
-        flaws, detector = self.options.flaws, self.sensor.detector
-        of_rows = {"pattern": self._pattern, "row_noise_e": flaws.row_noise}
-        return deliver_image(grey_values(electrons, detector, exposure_ms=exposure_ms, rng=rng, **of_rows), flaws)
+        image = grey_values(
+            electrons,
+            self.sensor.detector,
+            exposure_ms=exposure_ms,
+            rng=rng,
+            pattern=self._pattern,
+            row_noise_e=self.options.flaws.row_noise,
+        )
+        return deliver_image(image, self.options.flaws)
 
     def truth(self, shot: Shot) -> FrameTruth:
         """Return the ground truth of every profile line of a shot."""

@@ -384,14 +384,13 @@ def add_glare(light: np.ndarray, share: float) -> np.ndarray:
 def add_ghost(light: np.ndarray, camera: Camera, share: float) -> np.ndarray:
     """Mirror the fraction ``share`` of light (H, W) at the principal point, blurred by a Gaussian of `GHOST_BLUR`.
 
-    Two reflections within a lens form such an image, upside down and out of focus, if its own beam is nearly parallel.
+    Light that the image sensor and then a surface of the lens reflect forms such an image, upside down and blurred.
     """
     cx, cy = camera.principal_point()
     turned = np.array([[-1, 0, 2 * cx], [0, -1, 2 * cy]])
     ghost = cv2.warpAffine(light, turned, light.shape[::-1])
-    return np.float32(1 - share) * light + np.float32(share) * cv2.GaussianBlur(
-        ghost, (0, 0), GHOST_BLUR * len(light[0])
-    )
+    blurred = cv2.GaussianBlur(ghost, (0, 0), GHOST_BLUR * camera.width_px)
+    return np.float32(1 - share) * light + np.float32(share) * blurred
 
 
 def laser_shares(height: int, width: int) -> np.ndarray:

@@ -108,6 +108,29 @@ def test_faint_side_lobes_take_fewer_samples(thesis, monkeypatch):
     assert images[0].sum() == pytest.approx(images[1].sum(), rel=3e-4)
 
 
+def test_slight_texture_takes_fewer_samples_in_lamp_images(thesis, monkeypatch):
+    spotted = plate(reflectance=0.5) | {"mottle": 0.15, "mottle_mm": 3.0}
+    scene = scene_of(spotted, block((40.0, 6.0, 12.0), (0.0, 0.0, -6.0), reflectance=0.1))
+    sensor, images, rendered = cropped(thesis, 160, 160), [], []
+    whole = PixelSampler.render
+
+    def counted(self: PixelSampler, *arguments: Any, spp: int, **kwargs: Any) -> np.ndarray:
+        rendered[-1] += len(arguments[2]) * spp
+        return whole(self, *arguments, spp=spp, **kwargs)
+
+    monkeypatch.setattr(PixelSampler, "render", counted)
+    for share in (0.05, 0.0):
+        monkeypatch.setattr("twin.light.renderer.EDGE_SHARE", share)
+        rendered.append(0)
+        images.append(Renderer(sensor, clear(0.3), scene, effects=NONE).irradiance("lamp", sensor_at(), spp=16))
+    assert 0.1 * rendered[1] < rendered[0] < 0.5 * rendered[1]
+    change = np.abs(images[0] - images[1]) / images[1].max()
+    assert (change == 0).sum() > 100, "edges are rendered as finely as before"
+    # Corners that differ by 5 % of the maximum at most; four samples average their difference to a fifth or less.
+    assert change.max() < 0.01
+    assert images[0].sum() == pytest.approx(images[1].sum(), rel=3e-4)
+
+
 def test_wide_stripes_take_fewer_samples_where_they_are_smooth(thesis, monkeypatch):
     # 23 px of standard deviation, broken by the edges and the shadow of a block.
     sensor = altered(cropped(thesis, 160, 160), {"laser": {"waist_radius_mm": 8.0}})
