@@ -493,12 +493,10 @@ def _divide_among_nodes(x: np.ndarray, y: np.ndarray, light: np.ndarray) -> None
         for j in range(count):
             column, row = math.floor(x[i, j]), math.floor(y[i, j])
             right, down = x[i, j] - column, y[i, j] - row
-            left_node, upper = column % count, row % count
-            right_node, lower = (left_node + 1) % count, (upper + 1) % count
-            light[upper, left_node] += (1 - right) * (1 - down)
-            light[upper, right_node] += right * (1 - down)
-            light[lower, left_node] += (1 - right) * down
-            light[lower, right_node] += right * down
+            for beside in range(2):
+                for below in range(2):
+                    share = (right if beside else 1 - right) * (down if below else 1 - down)
+                    light[(row + below) % count, (column + beside) % count] += share
 
 
 @dataclass(frozen=True, eq=False)

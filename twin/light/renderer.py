@@ -109,7 +109,8 @@ class SurfaceLight:
 
         The second value is that of the first source alone, without the side lobes of its sheet.
         """
-        total, main, end, bsdf = mi.Float(0.0), mi.Float(0.0), segment.end(), segment.si.bsdf()
+        total, main, end, si = mi.Float(0.0), mi.Float(0.0), segment.end(), segment.si
+        bsdf = si.bsdf()
         for light in sources:
             here = light.evaluate(end, after_s)
             across = light.sheet.parts
@@ -119,16 +120,14 @@ class SurfaceLight:
             if self.objects.translucent:
                 body, coat = mi.BSDFContext(), mi.BSDFContext()
                 body.type_mask, coat.type_mask = mi.BSDFFlags.DiffuseReflection, mi.BSDFFlags.GlossyReflection
-                normal = pose.object_direction(segment.si.n, after_s)
-                spread = (
-                    spread_irradiance(self.objects, segment.si, normal, here, each) for each in (across, across[:1])
-                )
+                normal = pose.object_direction(si.n, after_s)
+                spread = (spread_irradiance(self.objects, si, normal, here, each) for each in (across, across[:1]))
                 parts = [(coat, here.irradiance, middle), (body, *spread)]
             bright = segment.valid & (sum((value for _, value, _ in parts), mi.Float(0.0)) > 0)
             lit = light.reaches(self.objects.scene, end, here, after_s, bright)
-            towards = segment.si.to_local(pose.direction(-here.direction, after_s))
+            towards = si.to_local(pose.direction(-here.direction, after_s))
             for context, value, of_main in parts:
-                sent = bsdf.eval(context, segment.si, towards, lit)[0]
+                sent = bsdf.eval(context, si, towards, lit)[0]
                 total += dr.select(lit, sent * value, 0.0)
                 if light is sources[0]:
                     main += dr.select(lit, sent * of_main, 0.0)

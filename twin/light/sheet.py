@@ -113,9 +113,7 @@ class Sheet:
         lobes = [(share, 2 * offset, radius) for offset, radius, share in laser.side_lobes]
         main = (1 - math.fsum(share for share, _, _ in lobes), 0.0, 1.0)
         self.parts: list[Part] = [(opaque(share), opaque(at), opaque(radius)) for share, at, radius in (main, *lobes)]
-        reaches = [
-            ((abs(offset) + LIT_SIGMAS * radius) / LIT_SIGMAS, share / radius) for share, offset, radius in lobes
-        ]
+        reaches = [(abs(offset) / LIT_SIGMAS + radius, share / radius) for share, offset, radius in lobes]
         self.reach = max([1.0, *(reach for reach, _ in reaches)])
         self.bright_reach = max([1.0, *(reach for reach, peak in reaches if peak > _FAINT_PEAK * main[0])])
         self._extinction = opaque(medium.extinction_per_mm(laser.wavelength_nm))

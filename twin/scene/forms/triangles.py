@@ -192,17 +192,13 @@ def _split_edges(values: np.ndarray, faces: np.ndarray, longest: float) -> tuple
     """
     done, strips = [], np.zeros((0, 4), int)  # corners a, b, c, d: b to c and d to a are short
     while len(faces) or len(strips):
-        middles, ends = [], []
-        for cells in (faces, strips):
-            beside = np.roll(cells, -1, axis=1)
-            squared = np.sum([np.square(axis[cells] - axis[beside]) for axis in values.T[:3].copy()], axis=0)
-            long = squared > longest**2
-            ends.append((np.minimum(cells, beside) * len(values) + np.maximum(cells, beside))[long])
-            middles.append(np.where(long, 0, -1))
-        edges, number = np.unique(np.concatenate(ends), return_inverse=True)
-        of_faces, of_strips = middles
-        for part, found in zip(middles, np.split(len(values) + number, [len(ends[0])]), strict=True):
-            part[part == 0] = found
+        ends = [np.stack([cells, np.roll(cells, -1, axis=1)], -1).reshape(-1, 2) for cells in (faces, strips)]
+        first, second = (order(*np.concatenate(ends).T) for order in (np.minimum, np.maximum))
+        long = sum(np.square(axis[first] - axis[second]) for axis in values.T[:3].copy()) > longest**2
+        edges, number = np.unique(first[long] * len(values) + second[long], return_inverse=True)
+        middle = np.full(len(long), -1)
+        middle[long] = len(values) + number
+        of_faces, of_strips = middle[: faces.size].reshape(-1, 3), middle[faces.size :].reshape(-1, 4)
         first, second = np.divmod(edges, len(values))
         values = np.vstack([values, (values[first] + values[second]) / 2])
         count = np.sum(of_faces >= 0, axis=1)
