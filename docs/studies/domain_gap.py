@@ -1,8 +1,8 @@
 """Domain gap between rendered data sets and real photographs, exposure of the data sets, and pictures of both.
 
-    python docs/studies/domain_gap.py FOLDER [--write]
-    python docs/studies/domain_gap.py FOLDER --classifier   # needs scikit-learn
-    python docs/studies/domain_gap.py FOLDER --pictures
+    python docs/studies/domain_gap.py FOLDER [PRESET ...] [--write]
+    python docs/studies/domain_gap.py FOLDER --classifier [--write]   # needs scikit-learn
+    python docs/studies/domain_gap.py FOLDER [PRESET ...] --pictures
 
 Data sets in the folder are kept. The classifier has extremely randomised trees of grey values, gradients, spectra and
 local binary patterns of pieces of the stripe. All scenes but one train it, and it judges the pieces of that scene.
@@ -22,7 +22,7 @@ from twin.datasets.data_set import LineStatus
 from uwlts.radiometry.domain_gap import measure_domain_gap
 from uwlts.radiometry.stripe_windows import measure_windows, open_image_set
 
-PRESETS = "stripe-clean", "stripe-turbid", "stripe-shiny", "stripe-tank", "pipe-inspection", "calibration-boards"
+PRESETS = "stripe-clean", "stripe-turbid", "stripe-shiny", "stripe-tank"
 DATA = ROOT / "tests" / "data"
 REAL = {
     "etna": DATA / "etna",

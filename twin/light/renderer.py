@@ -78,7 +78,6 @@ class _LocatedStripes:
     """Stripes of a pose in cells of the nodes' grid, and what else is known of that pose."""
 
     pose: SensorPose
-    first: np.ndarray  # mask of the cells that the first laser's stripe meets
     bright: np.ndarray  # mask of the cells that light of any stripe reaches, without faint side lobes
     lit: np.ndarray  # mask of the cells that light of any stripe reaches
     nodes: tuple[np.ndarray, list[np.ndarray]] | None
@@ -222,16 +221,16 @@ class StripeLocator:
         return last
 
     def lit_pixels(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray]:
-        """Return rows and columns of the pixels whose chief rays meet the stripe of the first laser."""
-        return find_marked(expand_cells(self.locate(pose).first, *self._size))
+        """Return rows and columns of pixels, among them all whose chief rays meet the stripe of the first laser."""
+        return find_marked(expand_cells(self.locate(pose).bright, *self._size))
 
     def _laser_nodes(
         self, pose: SensorPose, direct: list[Light], mirrored: list[Light]
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[np.ndarray, list[np.ndarray]]]:
-        """Return three masks of cells (rows, columns) as in `_LocatedStripes`, haze and lit surfaces."""
+    ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, list[np.ndarray]]]:
+        """Return the masks of bright and lit cells (rows, columns) as in `_LocatedStripes`, haze and lit surfaces."""
         bundle, shape = self.pixels.view.trace_grid(NODE_SPACING_PX)
         lit = np.zeros((shape[0] - 1, shape[1] - 1), bool)
-        first_lit, bright, reach = lit.copy(), lit.copy(), np.zeros_like(lit, np.float32)
+        bright, reach = lit.copy(), np.zeros_like(lit, np.float32)
         image = np.zeros(self._size, np.float32)
         surfaces: list[Float] = []
         scatters = self.surfaces.scattering.coefficient > 0 and (self.effects.haze or self.effects.multiple_scattering)
@@ -253,22 +252,19 @@ class StripeLocator:
                         scattered += compute_haze(crossed, light, self.surfaces.objects.scene, segment, here)
                 reached = [light.may_reach(segment.end(), here) for light, here in zip(sources, ends, strict=True)]
                 dr.eval(depth, scattered, surfaces, *across, *reached)
-                lit_there = [True if there is None else there.numpy().reshape(shape) for there in reached]
-                sigmas = [each.numpy().reshape(shape) for each in across]
-                near, stripes = np.zeros_like(lit), []
-                for light, each, there in zip(sources, sigmas, lit_there, strict=True):
-                    near |= mark_near_sheet(each, there)
-                    stripes.append(mark_near_sheet(each * (light.sheet.reach / light.sheet.bright_reach), there))
-                bright |= np.any(stripes, axis=0)
-                if index == 0:
-                    first_lit |= stripes[0]
+                near = np.zeros_like(lit)
+                for light, each, there in zip(sources, across, reached, strict=True):
+                    sigmas = each.numpy().reshape(shape)
+                    mask = True if there is None else there.numpy().reshape(shape)
+                    near |= mark_near_sheet(sigmas, mask)
+                    bright |= mark_near_sheet(sigmas * (light.sheet.reach / light.sheet.bright_reach), mask)
                 if self.pixels.defocus:
                     reach = np.fmax(reach, self.pixels.blur_px(near, depth.numpy().reshape(shape)))
                 lit |= near
             if moment is pose and dr.width(scattered) > 1:
                 image = expand_cells(0.25 * combine_corners(np.add, scattered.numpy().reshape(shape)), *self._size)
         bright, lit = (dilate_cells(each, reach) for each in (bright, lit))
-        return first_lit, bright, lit, (image, [each.numpy().reshape(shape) for each in surfaces])
+        return bright, lit, (image, [each.numpy().reshape(shape) for each in surfaces])
 
     def _moments(self, pose: SensorPose, sources: list[Light]) -> Iterator[tuple[SensorPose, list[Light]]]:
         """Yield the pose and its lights, and further poses during the exposure if the sensor moves."""
