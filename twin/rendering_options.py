@@ -67,8 +67,6 @@ class Flaws:
 
     glare: float = _flaw(off=0.0, typical=0.02, least=0.0, most=0.5)
     """Fraction of an image's light that lens and window spread over it: veiling glare (ISO 9358)."""
-    ghost: float = _flaw(off=0.0, typical=0.003, least=0.0, most=0.1)
-    """Fraction of an image's light that image sensor and lens reflect to a blurred image, mirrored at the axis."""
     vignetting: float = _flaw(off=0.0, typical=0.4, least=0.0, most=0.99)
     """Relative loss of light at the image's farthest corner, in addition to the cosine-fourth law."""
     uneven_lamp: float = _flaw(off=0.0, typical=0.6, least=0.0, most=0.99)
@@ -87,6 +85,8 @@ class Flaws:
     """Reflectance of the camera's window for a ring lamp around the lens, which appears out of focus."""
     dirt: float = _flaw(off=0.0, typical=0.1, least=0.0, most=0.9)
     """Fraction of the camera's window that is covered with spots, which darken blurred patches of the image."""
+    ghost: float = _flaw(off=0.0, typical=0.003, least=0.0, most=0.1)
+    """Fraction of an image's light that image sensor and lens reflect to a blurred image, mirrored at the axis."""
     lamp_and_laser: bool = False
     """Lamp and laser are on in every image, so that it shows stripe and board."""
     pixel_aspect: float = _flaw(off=1.0, typical=1.002, least=0.9, most=1.1)

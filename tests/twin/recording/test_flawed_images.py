@@ -21,7 +21,6 @@ from uwlts.storage.truth import TruthStatus, read_truth, truth_path
 
 TYPICAL = [
     "glare=0.02",
-    "ghost=0.003",
     "vignetting=0.4",
     "uneven-lamp=0.6",
     "particles=1000",
@@ -31,6 +30,7 @@ TYPICAL = [
     "side-lobes=0.01",
     "lamp-reflection=0.001",
     "dirt=0.1",
+    "ghost=0.003",
     "lamp-and-laser",
     "pixel-aspect=1.002",
     "tangential=0.001",
