@@ -118,20 +118,17 @@ def read(
 
 
 _DESCRIPTIONS = (
-    ("plan of an acceptance test", {"volume_mm", "mpe"}, "uwlts accept"),
-    ("campaign", {"recordings"}, "twin predict --campaign, twin experiment --campaign"),
-    ("data set", {"vary"}, "twin dataset"),
-    ("design study", {"variables", "title"}, "twin sweep"),
-    ("design study", {"choices", "title"}, "twin sweep"),
-    ("scene", {"objects"}, "twin simulate"),
-    ("scene", {"motion"}, "twin simulate"),
-    ("plan of a scan", {"title", "stage", "sensor"}, "uwlts scan"),
-    ("description of a folder of images", {"stage", "sensor"}, "uwlts import"),
-    ("order of a report", {"datum"}, "uwlts findings-report --order"),
-    ("order of a report", {"client"}, "uwlts findings-report --order"),
-    ("order of a report", {"limits"}, "uwlts findings-report --order"),
+    ("plan of an acceptance test", ({"volume_mm", "mpe"},), "uwlts accept"),
+    ("campaign", ({"recordings"},), "twin predict --campaign, twin experiment --campaign"),
+    ("data set", ({"vary"},), "twin dataset"),
+    ("design study", ({"variables", "title"}, {"choices", "title"}), "twin sweep"),
+    ("scene", ({"objects"}, {"motion"}), "twin simulate"),
+    ("plan of a scan", ({"title", "stage", "sensor"},), "uwlts scan"),
+    ("description of a folder of images", ({"stage", "sensor"},), "uwlts import"),
+    ("target", ({"kind", "columns", "rows"},), "uwlts import and uwlts camera --target"),
+    ("order of a report", ({"datum"}, {"client"}, {"limits"}), "uwlts findings-report --order"),
 )
-"""Kinds of descriptions, keys by which they are recognised in this order, and the command that uses them."""
+"""Kinds of descriptions in the order of recognition, alternative keys, and the command that uses them."""
 
 
 def describe(path: str | Path, *, unit: Unit | None = None, pose_format: PoseFormat = SAVED_FORMAT) -> str:
@@ -178,8 +175,8 @@ def _name_description(path: Path) -> list[str]:
     if path.suffix == ".toml" and is_regular_file(path):
         with suppress(ValueError):
             table = parse_toml(read_text(path, most_bytes=MOST_TOML_BYTES, called="description"))
-    for kind, keys, command in _DESCRIPTIONS:
-        if table.keys() >= keys:
+    for kind, some, command in _DESCRIPTIONS:
+        if any(table.keys() >= keys for keys in some):
             title = table.get("title") or table.get("name")
             return [kind + (f": {title}" if title else ""), f"with {', '.join(table)}", f"used by {command}"]
     return []

@@ -95,12 +95,12 @@ def export(
         return len(cloud)
     if region_mm is not None or at_most is not None:
         raise CaptureError(f"{file} is not a cloud: only clouds have regions and points")
-    if Path(out).name.lower().endswith(CLOUD_FORMATS):
-        raise OutputError(
-            f"{file} is a capture, which is exported to a folder of images, but {out} is named like a cloud; "
-            "give the name of a new folder, or make a cloud of it first (uwlts reconstruct)"
-        )
     with Capture(file) as capture:
+        if Path(out).name.lower().endswith(CLOUD_FORMATS):
+            raise OutputError(
+                f"{file} is a capture, which is exported to a folder of images, but {out} is named like a cloud; "
+                "give the name of a new folder, or make a cloud of it first (uwlts reconstruct)"
+            )
         export_capture(capture, Path(out), image_format=images, progress=progress)
         return len(capture)
 

@@ -25,15 +25,11 @@ _LENGTHS = {"nm": 1e-6, "um": 1e-3, "mm": 1.0, "cm": 10.0, "dm": 100.0, "m": 1e3
 _LENGTHS |= {"in": 25.4, "ft": 304.8, "yd": 914.4}
 _ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "gon": np.pi / 200}
 _TIMES = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
-_SAME_UNITS = {"degree": "deg", "°": "deg", "radian": "rad", "grad": "gon", "second": "s", '"': "in", "foot": "ft"}
-_SAME_UNITS |= {
-    f"{name}{ending}": unit
-    for prefix, unit in (("", "m"), ("milli", "mm"), ("centi", "cm"), ("micro", "um"), ("kilo", "km"))
-    for name in (f"{prefix}metre", f"{prefix}meter")
-    for ending in ("", "s")
-}
-_SAME_UNITS |= {f"{name}s": unit for name, unit in _SAME_UNITS.items() if name in ("degree", "radian", "second")}
-_SAME_UNITS |= {"microns": "um", "micron": "um", "inches": "in", "inch": "in", "feet": "ft"}
+_SAME_UNITS = {"degree": "deg", "°": "deg", "radian": "rad", "grad": "gon", "second": "s", "micron": "um"}
+_SAME_UNITS |= {'"': "in", "inch": "in", "inche": "in", "foot": "ft", "feet": "ft"}
+_PREFIXES = {"": "m", "milli": "mm", "centi": "cm", "micro": "um", "kilo": "km"}
+_SAME_UNITS |= {f"{prefix}met{end}": unit for prefix, unit in _PREFIXES.items() for end in ("re", "er")}
+"""Units by their names in the singular."""
 _UNITS = _LENGTHS | _ANGLES | _TIMES
 _DIRECTIONS = {"east": (1, 0, 0), "north": (0, 1, 0), "up": (0, 0, 1)}
 _DIRECTIONS |= {"west": (-1, 0, 0), "south": (0, -1, 0), "down": (0, 0, -1)}
@@ -41,9 +37,8 @@ _HEIGHTS = {"height": "up", "altitude": "up", "alt": "up", "elevation": "up", "d
 _LETTERS = {name[0]: name for name in ("east", "north", "up", "down")}
 _UNITS_OF = (
     {"time_s": _TIMES}
-    | dict.fromkeys(_DIRECTIONS, _LENGTHS)
-    | dict.fromkeys("xyz", _LENGTHS)
-    | dict.fromkeys(ROTATION_NAMES[4:], _ANGLES)
+    | dict.fromkeys((*"xyz", *_DIRECTIONS), _LENGTHS)
+    | dict.fromkeys((*ROTATION_NAMES[4:], "phi", "theta", "psi", "omega", "kappa"), _ANGLES)
 )
 """Units of the columns whose units are converted or checked."""
 _SAME_NAMES = {name: name for name in (*ROTATION_NAMES, *_DIRECTIONS)} | _HEIGHTS
@@ -256,20 +251,29 @@ def _names_and_units(cells: list[str], path: Path) -> tuple[list[str], dict[str,
 
 def _name_axes(names: list[str], path: Path) -> tuple[list[str], tuple[str, ...]]:
     """Return names with x, y and z for three directions, and these; DescriptionError for a left-handed frame."""
-    found = tuple(name for name in names if name in _DIRECTIONS)
-    if len(found) != 3 or not np.linalg.det([_DIRECTIONS[name] for name in found]):
+    if "x" not in names and {"lat", "latitude"} & {*names}:
+        raise DescriptionError(f"{path} has latitudes, which are angles: convert positions to lengths, such as UTM")
+    known = _DIRECTIONS if "z" in names else _DIRECTIONS | {"x": _DIRECTIONS["east"], "y": _DIRECTIONS["north"]}
+    found = tuple(name for name in names if name in known)
+    if len(found) != 3 or not (volume := np.linalg.det([known[name] for name in found])):
         return names, ()
-    if np.linalg.det([_DIRECTIONS[name] for name in found]) < 0:
+    if volume < 0 or "x" in found:
+        other = ", or name x and y north and east if they are" if "x" in found else ""
         raise DescriptionError(
             f"{path} has the axes {', '.join(found)}, a left-handed frame that mirrors all shapes: exchange the first "
-            "two, or change the sign of the last"
+            f"two, or change the sign of the last{other}"
         )
     return [dict(zip(found, "xyz", strict=True)).get(name, name) for name in names], found
 
 
 def _spell_directions(names: list[str]) -> list[str]:
-    """Return names with three directions that are letters, such as n, e and d, in full."""
-    return [_LETTERS.get(name, name) for name in names] if len(_LETTERS.keys() & names) == 3 else names
+    """Return three letters of directions, such as n, e and d, in full; up beside x and y as z, and z as up else."""
+    same = _LETTERS if len(_LETTERS.keys() & names) == 3 else {}
+    if {"x", "y"} <= {*names}:
+        same = {} if "z" in names else {"up": "z"}
+    elif len(_DIRECTIONS.keys() & names) == 2:
+        same = {"z": "up"}
+    return [same.get(name, name) for name in names]
 
 
 def _is_unit_row(line: bytes) -> bool:
@@ -408,7 +412,7 @@ def _split_unit(cell: str) -> tuple[str, str | None]:
 
 def _plain_unit(unit: str) -> str:
     unit = unit.strip().replace("µ", "u").replace("μ", "u")
-    return _SAME_UNITS.get(unit, unit)
+    return _SAME_UNITS.get(unit.removesuffix("s") if len(unit) > len("sec") else unit, unit)
 
 
 def _normalise_name(name: str) -> str:

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
 from uwlts.errors import DescriptionError
@@ -24,6 +25,12 @@ FARTHEST_MM = 1e7
 """Ten kilometres: no platform reaches farther, and squares of larger numbers would lose the noise."""
 
 _COMPASS = ("north", "east", "down")
+_SAME_ANGLES = (
+    {"heading": "yaw"},
+    {"phi": "roll", "theta": "pitch", "psi": "yaw"},
+    {"omega": "roll", "phi": "pitch", "kappa": "yaw"},
+)
+"""Names of angles on compasses, in navigation and in photogrammetry."""
 _ROUNDED = 2e-3
 """Deviation from a rigid matrix or a unit quaternion when numbers have three decimals."""
 _FORMAT = re.compile(
@@ -32,10 +39,12 @@ _FORMAT = re.compile(
 _COLUMNS = {"matrix": (12, 16), "quaternion": (7,), "rotvec": (6,), "euler": (6,), "angle": (1,)}
 """Numbers of columns of a pose, by the first word of the format."""
 _FORMATS = "matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-zyx-deg (fixed axes), euler-ZYX-deg"
-_LAGS = (2, 3, 4)  # two sources in turn, or one with two or three times the rate; slower patterns may be waves
 _FEWEST_POSES, _ALTERNATING, _RETURNED, _LEAST_JUMP_MM, _REACH_MM = 10, 0.2, 0.3, 0.1, 300.0
-"""Two sources: least number of poses, share that jumps, largest distance after it relative to the jump, smallest jump,
-and lever of rotations. Of independent noise along one axis, 17 % jump, in a plane 9 %."""
+"""Two sources: least number of poses, share that jumps, largest rest of a jump after it, smallest jump, and lever of
+rotations. Of independent noise along one axis, 15 % jump, in a plane 5 %."""
+_AROUND, _SAME, _LONG, _LIKE_LONGEST, _FEWEST_LONG, _OFTEN, _BACK = 9, 0.3, 6.0, 0.6, 4, 0.02, 0.8
+"""Two sources in bursts: number of poses with a common motion, and quantile of the steps without it. Least jump
+relative to this and to the longest steps, least number of jumps, and least shares of the poses and of jumps back."""
 _NEAR_HALF_TURN = 3.0
 """Angles in rad reach pi, unless turns are small; the largest in deg is between 3 and pi by chance only."""
 _METRES = np.array([1e3] * 3 + [1.0] * 3)
@@ -169,18 +178,20 @@ def _find_alternation(poses: np.ndarray) -> list[str]:
         return []
     axes = (poses[:, :3, 3] + _REACH_MM * poses[:, :3, axis] for axis in (0, 1))
     places = np.concatenate([poses[:, :3, 3], *axes], axis=1)
-    steps, double_steps = (np.linalg.norm(places[lag:] - places[:-lag], axis=1) for lag in (1, 2))
-    shorter = np.minimum(steps[:-1], steps[1:])
-    jumps = (double_steps < _RETURNED * shorter) & (shorter > _LEAST_JUMP_MM)
-    # Every second, third or fourth pose lies on a smooth path of its own, also if the offset is along the path.
-    bent = np.linalg.norm(np.diff(places, 2, axis=0), axis=1)
-    every = [jumps.copy() for _ in _LAGS]
-    for lag, found in zip(_LAGS, every, strict=True):
-        smooth = np.linalg.norm(places[2 * lag :] - 2 * places[lag:-lag] + places[: -2 * lag], axis=1)
-        found[lag - 1 : 1 - lag] |= smooth < _RETURNED * np.where(bent > 2 * _LEAST_JUMP_MM, bent, 0)[lag - 1 : 1 - lag]
-    jumps = max(every, key=np.mean)
+    # Every second pose lies on a smooth path of its own, also if the offset is along the path.
+    smooth, near = (np.linalg.norm(places[2 * n :] - 2 * places[n:-n] + places[: -2 * n], axis=1) for n in (2, 1))
+    jumps = np.pad((near[1:-1] > 2 * _LEAST_JUMP_MM) & (smooth < _RETURNED * near[1:-1]), 1)
     if np.mean(jumps) < _ALTERNATING:
-        return []
+        # Bursts of two sources: each long move, apart from the motion of all, is taken back by the next one.
+        moves = np.diff(places, axis=0)
+        moves -= median_filter(moves, (_AROUND, 1))
+        sizes = np.linalg.norm(moves, axis=1)
+        middle, longest = np.quantile(sizes, (_SAME, 1 - _OFTEN))
+        long = np.flatnonzero(sizes > max(_LONG * middle, _LIKE_LONGEST * longest, _LEAST_JUMP_MM))
+        back = np.linalg.norm(moves[long[1:]] + moves[long[:-1]], axis=1) < _RETURNED * sizes[long[1:]]
+        if len(long) < max(_FEWEST_LONG, _OFTEN * len(poses)) or np.mean(back) < _BACK:
+            return []
+        jumps = np.isin(np.arange(len(poses) - 2), long)
     changes = (np.linalg.norm(np.diff(poses[:, :3, column], axis=0), axis=1)[:-1][jumps] for column in (0, 3))
     turned, moved = map(np.median, changes)
     return [
@@ -197,17 +208,21 @@ def _poses(table: NumberTable, pose_format: PoseFormat, unit: Unit | None) -> tu
     if (numbers := columns.pop("pose", None)) is not None:
         log_warnings(path, _number_gaps(numbers, path))
     units = table.units
-    if "heading" in columns:
-        if table.directions != _COMPASS:
-            raise DescriptionError(
-                f"{path} has a heading, clockwise from north, a yaw only for {', '.join(_COMPASS)} as x, y, z: "
-                "name positions so, or convert it (for east, north, up: yaw = 90 deg - heading) and name it yaw"
-            )
-        columns, units = ({("yaw" if n == "heading" else n): each for n, each in d.items()} for d in (columns, units))
+    if "heading" in columns and table.directions != _COMPASS:
+        raise DescriptionError(
+            f"{path} has a heading, clockwise from north, a yaw only for {', '.join(_COMPASS)} as x, y, z: "
+            "name positions so, or convert it (for east, north, up: yaw = 90 deg - heading) and name it yaw"
+        )
+    axes = (known["axes"] or "") if (known := _FORMAT.fullmatch(pose_format)) else ""
+    same = next((each for each in _SAME_ANGLES if each.keys() <= columns.keys()), {})
+    if len(set(axes.lower())) != 2:  # proper Euler angles, such as ZXZ, have no roll
+        columns, units = ({same.get(name, name): each for name, each in d.items()} for d in (columns, units))
     names = _order_names([*columns], pose_format, path)
-    for name in names:
+    if axes and any(name not in ROTATION_NAMES and not name.isdigit() for name in names[3:]):
+        log_warnings(path, [f"{', '.join(names[3:])} are read as angles about {', '.join(axes)}, in this order"])
+    for name in names if axes else ROTATION_NAMES:
         stated = units.get(name, "")
-        if name in ROTATION_NAMES and stated and stated != pose_format.rpartition("-")[2]:
+        if name not in {*"xyz"} and stated and stated != pose_format.rpartition("-")[2]:
             raise DescriptionError(
                 f"{path} has {name} in {stated}, but the format is {pose_format}: choose a format that ends "
                 "with the angles' unit, -deg or -rad"
@@ -240,38 +255,36 @@ def _number_gaps(numbers: np.ndarray, path: Path) -> list[str]:
 
 def _order_names(names: list[str], pose_format: PoseFormat, path: Path) -> list[str]:
     """Return the names of columns in the order of the format; raises DescriptionError if they contradict it."""
-    kinds = {
-        "quaternion": ("qw", "qx", "qy", "qz"),
-        "euler": ("roll", "pitch", "yaw"),
-        "turns": ("rx", "ry", "rz"),
-        "angle": ("angle",),
-    }
-    named = next((kind for kind, parts in kinds.items() if set(parts) <= set(names)), None)
-    allowed = {"turns": ("rotvec", "euler")}.get(named or "", (named,))
+    kinds = (
+        (("quaternion",), ("qw", "qx", "qy", "qz")),
+        (("euler",), ("roll", "pitch", "yaw")),
+        (("rotvec", "euler"), ("rx", "ry", "rz")),
+        (("angle",), ("angle",)),
+    )
     form, _, order = pose_format.partition("-")
-    if named and form not in allowed:
+    forms, turns = next((each for each in kinds if set(each[1]) <= set(names)), ((form,), ()))
+    if form not in forms:
         raise DescriptionError(
             f"{path} has the columns {', '.join(names)}, but the format is {pose_format}: choose the format "
             "that the names describe"
         )
-    found: list[str] = [axis for axis in "xyz" if axis in names]
-    if len(found) < 3 or named is None or len(names) != len(found) + len(kinds[named]):
-        if [name for name in names[:3] if name in found] != found:
-            raise DescriptionError(
-                f"{path} has the columns {', '.join(names)}: expected x, y and z first, or names of all columns, such "
-                "as qw, qx, qy, qz"
-            )
+    found = [name for name in names if name not in turns]
+    found = [*"xyz"] if {*"xyz"} == {*found} else found
+    if any(name in {*"xyz"} and name != "xyz"[number : number + 1] for number, name in enumerate(found)):
+        raise DescriptionError(
+            f"{path} has the columns {', '.join(names)}: expected x, y and z first, or names of all columns, such as "
+            "qw, qx, qy, qz"
+        )
+    if not turns or len(found) != (0 if form == "angle" else 3):
         return names
-    match named:
-        case "quaternion":
-            return [*found, *(f"q{axis}" for axis in order)]
-        case "euler" | "turns" if form == "euler":
-            axes = order[:3].lower()
-            if len(set(axes)) < 3:
-                raise DescriptionError(f"{path} names its angles by axis, but {pose_format} turns twice about one axis")
-            return [*found, *(kinds[named]["xyz".index(axis)] for axis in axes)]
-        case _:
-            return [*found, *kinds[named]]
+    if form == "quaternion":
+        return [*found, *(f"q{axis}" for axis in order)]
+    if form == "euler":
+        axes = order[:3].lower()
+        if len(set(axes)) < 3:
+            raise DescriptionError(f"{path} names its angles by axis, but {pose_format} turns twice about one axis")
+        return [*found, *(turns["xyz".index(axis)] for axis in axes)]
+    return [*found, *turns]
 
 
 def poses_from_rows(rows: np.ndarray, pose_format: str, path: Path) -> np.ndarray:

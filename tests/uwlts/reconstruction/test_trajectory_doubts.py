@@ -144,7 +144,7 @@ def test_the_clocks_of_time_scales_are_named(shift, names):
 
 
 @pytest.mark.parametrize("kind", ["steady", "accelerating", "noisy", "stop and go", "rotary", "curved"])
-@pytest.mark.parametrize("pattern", [(0, 1), (0, 0, 1), (0,)])
+@pytest.mark.parametrize("pattern", [(0, 1), (0, 0, 1), 5 * (0,) + 5 * (1,), (0,)])
 @pytest.mark.parametrize("offset", ["place", "turn"])
 def test_two_sources_in_one_track_are_noticed(tmp_path, kind, pattern, offset):
     times, places, quaternions = trajectory(kind)

@@ -37,6 +37,20 @@ def test_all_that_is_read_is_described(thesis: Sensor, tmp_path: Path):
     assert describe("thesis").startswith("sensor 'thesis'")
 
 
+@pytest.mark.parametrize(
+    ("keys", "kind"),
+    [
+        ('title = "t"\nchoices = 1', "design study: t"),
+        ("motion = 1", "scene"),
+        ("limits = 1", "order of a report"),
+        ('kind = "chessboard"\ncolumns = 9\nrows = 6', "target"),
+    ],
+)
+def test_other_descriptions_are_named_by_their_keys(tmp_path: Path, keys: str, kind: str):
+    (tmp_path / "a.toml").write_text(keys)
+    assert describe(tmp_path / "a.toml").splitlines()[0] == kind
+
+
 @pytest.mark.parametrize(("name", "text"), [("other.json", '{"format": "other"}'), ("notes.doc", "notes")])
 def test_other_files_are_refused_with_what_is_read(tmp_path: Path, name: str, text: str):
     (tmp_path / name).write_text(text)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.uwlts.storage.test_capture import a_header, record, small_sensor
 from uwlts import cli
-from uwlts.errors import OutputError, SetupError
+from uwlts.errors import CaptureError, OutputError, SetupError
 from uwlts.runtime.console import run
 from uwlts.storage.capture import Capture, Frame
 from uwlts.storage.capture_writer import CaptureWriter
@@ -282,3 +282,9 @@ def test_ply_with_float_is_read_by_programs_without_double(tmp_path: Path, reach
     with pytest.raises(OutputError, match="beyond 16 m from the origin"):
         write_cloud(tmp_path / "b.float.ply", a_cloud(reach_mm=1e5))
     assert not (tmp_path / "b.float.ply").exists()
+
+
+def test_a_folder_is_not_called_a_capture(tmp_path: Path):
+    (tmp_path / "bag").mkdir()
+    with pytest.raises(CaptureError, match="bag: it is a directory"):
+        export(tmp_path / "bag", tmp_path / "a.ply")

@@ -18,7 +18,7 @@ from uwlts.storage.export_ import export
 from uwlts.storage.image_file import SUFFIXES, read_image
 from uwlts.storage.import_.folder import import_images
 from uwlts.storage.import_.grey_values import extract_channel
-from uwlts.storage.import_.matching import read_rows
+from uwlts.storage.import_.matching import POSE_COLUMNS, read_rows
 from uwlts.stripe import extract_stripe
 
 WIDTH, HEIGHT = 96, 64
@@ -593,6 +593,9 @@ def test_sixteen_bits_leave_no_room_for_a_sign(tmp_path: Path):
     refused(folder_of(tmp_path, images, given), tmp_path, DescriptionError, "16 bits leave no room for its sign")
 
 
+OF_POSES = ",".join(["file", *POSE_COLUMNS])
+
+
 @pytest.mark.parametrize(
     ("table", "words"),
     [
@@ -611,6 +614,8 @@ def test_sixteen_bits_leave_no_room_for_a_sign(tmp_path: Path):
         ("file,stage_mm\n,1\n", "line 2: the file's name is missing"),
         ("file,stage_mm,background\nl1.png,1,l2.png\nl3.png,2,\n", "a background for 1 of 2 laser images"),
         ("file,pose_00\nl1.png,1\n", "only 1 of the 16 elements"),
+        (f"{OF_POSES}\nl1.png,1,0,0,0,0,1,0,0,0,0,1,0,5,0,0,1\n", "line 2: pose 1 .* column by column: expected row"),
+        (f"{OF_POSES}\nl1.png,1,0,0,0,0,1,0,0,0,0,-1,0,0,0,0,1\n", "line 2: pose 1 .* It is a reflection"),
         ("file,light\nl1.png,laser\n", "column light, and there are patterns"),
         ("file,stage_mm,light\nl1.png,3,sun\n", "the light is 'sun'"),
     ],

@@ -118,12 +118,36 @@ def test_names_decide_the_order_of_a_quaternion(tmp_path: Path, pose_format: str
         ("Yaw [rad],Pitch [rad],Roll [rad]", (0.3, -0.2, 0.5)),
         ("rx,ry,rz", (0.5, -0.2, 0.3)),
         ("a,b,c", (0.3, -0.2, 0.5)),
+        ("phi,theta,psi", (0.5, -0.2, 0.3)),
+        ("psi_rad,theta_rad,phi_rad", (0.3, -0.2, 0.5)),
+        ("Omega,Phi,Kappa", (0.5, -0.2, 0.3)),
     ],
 )
-def test_names_decide_the_axes_of_euler_angles(tmp_path: Path, header: str, angles: tuple[float]):
-    (tmp_path / "a.csv").write_text(f"X_mm,Y_mm,Z_mm,{header}\n1,2,3,{','.join(map(str, angles))}\n")
+@pytest.mark.parametrize("places", ["X_mm,Y_mm,Z_mm", "x,y,height", "# easting northing z"])
+def test_names_decide_the_axes_of_euler_angles(tmp_path: Path, caplog, places: str, header: str, angles: tuple[float]):
+    (tmp_path / "a.csv").write_text(f"{places},{header}\n1,2,3,{','.join(map(str, angles))}\n")
     poses, _ = read_poses(tmp_path / "a.csv", pose_format="euler-zyx-rad")
     assert poses[0, :3, :3] == pytest.approx(TURN.as_matrix(), abs=1e-12)
+    assert poses[0, :3, 3].tolist() == [1, 2, 3]
+    assert ("a, b, c are read as angles about z, y, x, in this order" in caplog.text) is (header == "a,b,c")
+
+
+def test_proper_euler_angles_keep_their_order(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    (tmp_path / "a.csv").write_text("x,y,z,phi,theta,psi\n1,2,3,0.5,-0.2,0.3\n")
+    poses, _ = read_poses(tmp_path / "a.csv", pose_format="euler-ZXZ-rad")
+    assert poses[0, :3, :3] == pytest.approx(Rotation.from_euler("ZXZ", [0.5, -0.2, 0.3]).as_matrix())
+    assert "about Z, X, Z" in caplog.text
+
+
+@pytest.mark.parametrize("places", ["easting,northing,z", "east,north,h", "lon,latitude,height"])
+def test_named_quaternions_are_read_beside_any_names_of_positions(tmp_path: Path, places: str):
+    (tmp_path / "a.csv").write_text(f"{places},qw,qx,qy,qz\n1,2,3,0,0,0,1\n")
+    if "lat" in places:
+        with pytest.raises(uwlts.Error, match="latitudes, which are angles"):
+            read_poses(tmp_path / "a.csv", pose_format="quaternion-xyzw")
+        return
+    poses, _ = read_poses(tmp_path / "a.csv", pose_format="quaternion-xyzw")
+    assert poses[0].round(12).tolist() == [[-1, 0, 0, 1], [0, -1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
 
 
 def test_radians_read_as_degrees_are_doubted(tmp_path: Path, caplog: pytest.LogCaptureFixture):
@@ -146,6 +170,8 @@ def test_radians_read_as_degrees_are_doubted(tmp_path: Path, caplog: pytest.LogC
         ("x,y,z,roll,pitch,yaw", "rotvec-deg", None, "the format that the names describe"),
         ("x,y,z,roll,pitch,yaw", "euler-zyz-deg", None, "twice about one axis"),
         ("a,b,c,x,y,z", "rotvec-rad", None, "x, y and z first"),
+        ("x,y,depth,roll,pitch,yaw", "euler-zyx-deg", None, "axes x, y, down, a left-handed frame .* if they are"),
+        ("x,y,z,psi_rad,theta_rad,phi_rad", "euler-zyx-deg", None, "in rad, but"),
     ],
 )
 def test_names_that_contradict_the_format_are_refused(tmp_path, header, pose_format, unit, message):
@@ -220,6 +246,7 @@ def test_headings_belong_to_north_east_down(tmp_path: Path, names, columns, firs
         ("# time_s,N,E,U,roll,pitch,yaw", "tneu00y", "left-handed frame"),
         ("time_s,pos_north,pos_east,alt,roll,pitch,yaw", "tneu00y", "left-handed frame"),
         ("time_s,east,north,depth,roll,pitch,yaw", "tend00y", "left-handed frame"),
+        ("time_s,northing,easting,z,roll,pitch,yaw", "tneu00y", "left-handed frame"),
     ],
 )
 def test_compass_angles_and_mirrored_frames_are_refused(tmp_path: Path, names, columns, words):

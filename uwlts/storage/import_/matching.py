@@ -18,6 +18,7 @@ from uwlts.storage.capture import NO_STAGE, POSE_ROUNDED
 from uwlts.storage.image_file import SUFFIXES
 from uwlts.storage.import_.folder_description import ImportDescription, Patterns
 from uwlts.storage.numbering import Counted, count_names, name_gaps, time_gaps
+from uwlts.storage.pose_files import check_matrices
 from uwlts.stripe import Stripe
 
 POSE_COLUMNS = tuple(f"pose_{row}{column}" for row in range(4) for column in range(4))
@@ -102,10 +103,7 @@ def _parse_row(number: int, cells: dict[str, str], place: str) -> ImageRow:
     if numbers["exposure_ms"] < 0:
         raise DescriptionError(f"{place}: exposure_ms is {numbers['exposure_ms']:g}; expected a time of 0 or more")
     if given and not is_rigid(pose, within=POSE_ROUNDED):
-        raise DescriptionError(
-            f"{place}: the pose is not a rotation with a shift: its columns must be orthogonal unit vectors, given "
-            f"with four decimals or more, its last row 0 0 0 1"
-        )
+        pose = check_matrices(pose[None], place)[0]
     return ImageRow(texts["file"], number, light, texts["background"] or None, pose=pose if given else None, **numbers)
 
 
