@@ -96,7 +96,7 @@ class Flaws:
     rolling_shutter: float = _flaw(off=0.0, typical=10.0, least=0.0, most=1000.0)
     """Delay in us between rows of a rolling shutter; visible while the stage moves."""
     row_noise: float = _flaw(off=0.0, typical=5.0, least=0.0, most=1000.0)
-    """Standard deviation in electrons of an offset that all pixels of a row share, drawn anew for each image."""
+    """Standard deviation in electrons of an offset that all pixels of a row share, different in each image."""
     jpeg: int = _flaw(off=0, typical=90, least=1, most=100)
     """Quality of JPEG compression; 8-bit images only."""
     colour_filter: bool = False

@@ -8,7 +8,7 @@ Data sets in the folder are kept. The classifier has extremely randomised trees 
 local binary patterns of pieces of the stripe. All scenes but one train it, and it judges the pieces of that scene.
 """
 
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -36,16 +36,16 @@ TREES = 500
 
 
 def gaps(sources: list[Path]) -> str:
-    """Return the table of domain gaps."""
+    """Return the table of domain gaps, with the fraction of real windows covered in all statistics at once."""
     found = measure_domain_gap(sources, real=list(REAL.values()), stripe=STRIPE)
     pairs = {(each.name, each.real): each for each in found.gaps}
     rows = []
-    for own in found.sets():
-        cells = []
-        for real in found.real:
-            pair = pairs.get((own.name, real.name))
-            cells.append("" if pair is None else f"{pair.gap:.2f} ± {pair.std:.2f}")
+    for own in found.generated:
+        of_real = [pairs[own.name, real.name] for real in found.real]
+        cells = [f"{pair.gap:.2f} ± {pair.std:.2f} ({100 * pair.covered_at_once:.0f} %)" for pair in of_real]
         rows.append([own.name, f"{len(own.values)}", *cells])
+    apart = [pairs[one.name, other.name].gap for one, other in combinations(found.real, 2)]
+    print(f"gaps between real sets: {min(apart):.2f} to {max(apart):.2f}")
     rows.append(["two halves of the set", "", *(f"{floor.gap:.2f} ± {floor.std:.2f}" for floor in found.floors)])
     return table(["set", "windows", *(f"gap: {name}" for name in REAL)], rows)
 

@@ -54,10 +54,10 @@ def grey_values(
     """Return the image (H, W), uint8 or uint16, for mean photo-electrons (H, W) and their exposure time.
 
     Signal and dark current have Poisson shot noise. Blooming and full well are applied before the read-out, which adds
-    offset pattern and noise, of which ``row_noise_e`` is common to the pixels of a row; the only quantisation is the
-    final rounding. Bands of rows have independent random numbers, so that the image does not depend on the number of
-    parallel tasks. Without ``rng`` there is no temporal noise, without ``pattern`` no fixed one. ImageError if the
-    electrons are not finite numbers from 0 to 1e15.
+    offset pattern and noise. The noise with the standard deviation ``row_noise_e`` is common to the pixels of a row.
+    The only quantisation is the final rounding. Bands of rows have independent random numbers, so that the image does
+    not depend on the number of parallel tasks. Without ``rng`` there is no temporal noise, without ``pattern`` no fixed
+    one. ImageError if the electrons are not finite numbers from 0 to 1e15.
     """
     electrons = np.asarray(electrons, np.float32)
     least, most = electrons.min(), electrons.max()

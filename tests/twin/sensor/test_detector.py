@@ -115,7 +115,7 @@ def test_rows_share_an_offset_that_is_new_in_each_image():
     rng, dark = np.random.default_rng(5), np.zeros((2000, 100), np.float32)
     images = [grey_values(dark, chip, exposure_ms=0.0, rng=rng, row_noise_e=noise_e) for _ in range(2)]
     first, second = (image.mean(axis=1) / chip.gain_dn_per_e() for image in images)
-    # Means over 100 pixels also have a tenth of the read noise; 2000 rows give the deviation to 1.6 %, four of which.
+    # Means over 100 pixels also have a tenth of the read noise; 2000 rows give the deviation to 1.6 %: four of these.
     assert first.std() == pytest.approx(np.hypot(noise_e, 0.4), rel=0.065)
     assert abs(np.corrcoef(first, second)[0, 1]) < 4 / np.sqrt(2000)
 
