@@ -55,7 +55,7 @@ myst_heading_anchors = 4
 # A tutorial is executed again when its text changed; a page that fails stops the build.
 nb_execution_mode = "cache"
 nb_execution_cache_path = str(ROOT / "docs" / "_build" / "notebooks")
-nb_execution_timeout = 600
+nb_execution_timeout = 1800
 nb_execution_raise_on_error = True
 nb_merge_streams = True
 

@@ -19,7 +19,8 @@ import numpy as np
 from cyclopts import App
 
 import uwlts
-from tests.uwlts.desk.test_scan_service import joint_calibration, plan_for, write_images
+from tests.uwlts.desk.test_scan_service import plan_for, write_images
+from tests.uwlts.joint_views import joint_calibration
 from tests.uwlts.storage.test_point_cloud2 import rows
 from twin.devices.grbl_controller import GrblController
 from uwlts.model.library import load_sensor
@@ -33,6 +34,7 @@ class Client:
 
     def __init__(self) -> None:
         import rclpy
+        from diagnostic_msgs.msg import DiagnosticArray
         from geometry_msgs.msg import PoseStamped
         from sensor_msgs.msg import PointCloud2
         from std_msgs.msg import String
@@ -43,6 +45,8 @@ class Client:
         self._node = rclpy.create_node("test")
         self.messages: list[Any] = []
         self._node.create_subscription(PointCloud2, "points", self.messages.append, 100)
+        self.states: list[Any] = []
+        self._node.create_subscription(DiagnosticArray, "/diagnostics", self.states.append, 100)
         self.advice: list[str] = []
         self._node.create_subscription(String, "next_pass", lambda message: self.advice.append(message.data), 100)
         pose, publisher = PoseStamped(), self._node.create_publisher(PoseStamped, "pose", 1)
@@ -100,6 +104,11 @@ def main() -> None:
             assert np.abs(points - 1e-3 * whole.points_mm).max() < 2e-5
             # Numbers of 64 bits for seconds since 1970 have steps of 2e-7 s.
             assert off_s < 1e-6
+            client.spin(lambda: client.states[-1].status[0].message == "the next pass is advised")
+            state = client.states[-1].status[0]
+            found = {each.key: each.value for each in state.values}
+            print(f"diagnostics: level {state.level!r}, {state.hardware_id}, {found}")
+            assert found == {"laser images": str(IMAGES), "points": str(len(points))}
             print("start:", client.call("start"))
             client.spin(lambda: len(client.messages) > IMAGES)
             print("laser_off:", client.call("laser_off"), "laser on:", controller.state().laser_on)

@@ -259,6 +259,30 @@ def datasets() -> list[Row]:
     ]
 
 
+def sensors() -> list[Row]:
+    """Cost of large image sensors: processor time per lit pixel relative to 1280 x 1024, and memory."""
+    from tests.bench.large_sensors import FINER, WORK, sensor_cost
+
+    small, rows = sensor_cost(1), []
+    for name, finer in FINER.items():
+        large = sensor_cost(finer)
+        for of in ("recorded", "labelled", "stripe", "points"):
+            times = large.per_lit_pixel(of, small)
+            rows.append(at_most(f"{name}, {large.ms[of]:.3g} ms a frame {WORK[of]}: a lit pixel", times, "times", 1.3))
+        rows.append(at_most(f"{name}: peak memory", large.peak_gb, "GB", 4))
+    return rows
+
+
+def live() -> list[Row]:
+    """Rate of rendered frames of 640 x 512 pixels while the stage moves, as `twin serve` shows them."""
+    from tests.bench.live import LESS_LIGHT, frame_rate
+
+    return [
+        at_least("frames of 640 x 512 while the stage moves, all effects", frame_rate(), "frames/s", 30),
+        at_least(f"the same without {' and '.join(LESS_LIGHT)}", frame_rate(*LESS_LIGHT), "frames/s", 30),
+    ]
+
+
 def streams() -> list[Row]:
     """Memory of long rides: profiles of 640 lines with a path, from 2,000 to 10,000."""
     from tests.bench.streams import stream_memory
@@ -327,7 +351,21 @@ def commands() -> list[Row]:
     ]
 
 
-_ALL = (demo, reproduction, rendering, light, campaign, pipeline, studies, datasets, streams, hardware, commands)
+_ALL = (
+    demo,
+    reproduction,
+    rendering,
+    light,
+    campaign,
+    pipeline,
+    studies,
+    datasets,
+    sensors,
+    live,
+    streams,
+    hardware,
+    commands,
+)
 SECTIONS = {section.__name__: section for section in _ALL}
 
 

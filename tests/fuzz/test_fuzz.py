@@ -15,7 +15,7 @@ from uwlts.files.writing import write_atomically
 from uwlts.storage.calibration_file import load_calibration
 
 CORPUS = Path(__file__).with_name("corpus")
-CASES = 200
+CASES = 100
 
 
 @pytest.fixture(scope="module")

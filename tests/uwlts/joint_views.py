@@ -5,12 +5,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tests.oracles.fermat import Face, directions_seen, plate, points_seen_on_plane
-from tests.uwlts.calibration_views import STEP_MM, WATER, inside, lattice, lens_of, nine_steps, through_window, turn
+from tests.uwlts.calibration_views import (
+    STEP_MM,
+    WATER,
+    built_sensor,
+    inside,
+    lattice,
+    lens_of,
+    nine_steps,
+    through_window,
+    turn,
+)
+from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.camera.camera_parameters import TargetImage
 from uwlts.calibration.capture_evidence import AirEvidence, StepEvidence
 from uwlts.calibration.joint.gathering import Gathered, Series
 from uwlts.calibration.joint.parameters import ViewMedium
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.model.artefacts import StepStandard
+from uwlts.model.calibration import Calibration
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.targets import parse_target
@@ -132,3 +145,13 @@ def assert_derivatives(evidence, parameters, global_values, local, *, within):
         behind[place] -= reach
         numeric = (residuals(ahead) - residuals(behind)) / (2 * reach)
         assert np.abs(column - numeric).max() <= within * np.abs(numeric).max() + 1e-6, place
+
+
+def joint_calibration(sensor: Sensor, *, columns: int = 25) -> Calibration:
+    """Return a joint calibration of the built sensor by six simulated poses of its target in water."""
+    noise = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(4))
+    series = target_series(
+        built_sensor(), medium=0, positions=np.arange(6) * 36.0 - 120.0, noise=noise, columns=columns
+    )
+    options = CalibrationOptions(poses="stage", correct_circles=False)
+    return solve_jointly(gathered(sensor, [series]), options=options).calibration

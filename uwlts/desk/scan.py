@@ -14,12 +14,12 @@ import time
 from array import array
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
 from itertools import count
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -247,13 +247,23 @@ class ScanDevices(NamedTuple):
     unlock: bool = False
 
 
+@dataclass
+class ServiceState:
+    """State of a scan as text, ``level`` "ok", "warning" or "error", and laser images and points published."""
+
+    message: str
+    level: Literal["ok", "warning", "error"] = "ok"
+    images: int = 0
+    points: int = 0
+
+
 class ScanService:
     """Scans on request, one at a time, each in a thread of its own: recorded by a plan, or played from a capture.
 
     `start`, `stop` and `laser_off` return at once, with a text for the caller; they raise Error if refused. ``publish``
     is called with the points of each laser image, and the time of the image in s since the start of the scan. A played
     capture may still be recorded by another program; it needs no ``devices``. ``advice`` is computed at the end of each
-    recorded scan, as a part of it. ``scans`` is the number of scans begun.
+    recorded scan, as a part of it. ``scans`` is the number of scans begun, ``state`` that of the latest.
     """
 
     def __init__(
@@ -271,7 +281,7 @@ class ScanService:
         self._source, self._calibration, self._publish, self._report = source, calibration, publish, report
         self._folder, self._devices = folder, devices
         self._stop, self._thread = threading.Event(), threading.Thread()
-        self.scans = 0
+        self.scans, self.state = 0, ServiceState("ready")
         warm_up()
 
     def start(self) -> str:
@@ -285,7 +295,7 @@ class ScanService:
             check_fits(self._source.header(path.stem), self._calibration, source=path.name)
             work, text = lambda: self._record(path), f"recording {path.name}"
         self._stop.clear()
-        self.scans += 1
+        self.scans, self.state = self.scans + 1, ServiceState(text)
         self._thread = threading.Thread(target=self._run, args=(work,), name="scan", daemon=True)
         self._thread.start()
         return text
@@ -313,11 +323,19 @@ class ScanService:
 
     def _run(self, work: Callable[[], str]) -> None:
         try:
-            self._report(work())
+            self._end(work(), self.state.level)
         except Ended:
-            self._report("stopped")
+            self._end("stopped", self.state.level)
         except Error as error:
-            self._report(f"error: {error}")
+            self._end(f"error: {error}", "error")
+
+    def _end(self, message: str, level: Literal["ok", "warning", "error"]) -> None:
+        self.state.message, self.state.level = message, level
+        self._report(message)
+
+    def _warn(self, text: str) -> None:
+        self.state.level = "warning"
+        self._report(f"warning: {text}")
 
     def _free_path(self, title: str) -> Path:
         name = "".join(sign if sign.isalnum() else "-" for sign in title.lower())
@@ -335,8 +353,12 @@ class ScanService:
             stage.unlock()
         header, pose = plan.header(out.stem), self._advice and self._advice.pose
         with BackgroundView(lambda frame, number: self._show(frame, number, header)) as shown:
-            listeners = ScanListeners(report=self._report, between=self._end_if_stopped, recorded=shown.put)
+            listeners = ScanListeners(
+                report=self._report, warn=self._warn, between=self._end_if_stopped, recorded=shown.put
+            )
             seen = record_scan(plan, out, camera=devices.camera, stage=stage, listeners=listeners)
+        if seen.warnings():
+            self.state.level = "warning"
         written = "; ".join([f"wrote {out}", *seen.warnings()])
         if self._advice is not None:
             self._report(written)
@@ -375,6 +397,7 @@ class ScanService:
             cloud = FrameProfile(frame, stripe, header, self._calibration).measured()
             placed = {"frame": np.full(len(cloud), number), "time_s": np.full(len(cloud), frame.time_s)}
             self._publish(replace(cloud, **placed), frame.time_s)
+        self.state.images, self.state.points = self.state.images + 1, self.state.points + len(stripe.lines)
 
     def close(self) -> None:
         """End the scan, and wait for its end."""
@@ -385,8 +408,9 @@ class ScanService:
 # --- node of ROS 2 ----------------------------------------------------------------------------------------------------
 
 
+_STATE_S = 1.0  # between two messages of diagnostics, which ROS's aggregator calls stale after 5 s
 _QUEUED = 100  # messages that a slow subscriber may be behind: 10 s of a camera with 10 images a second
-_WHEELS = ("ros-rclpy", "ros-rmw-fastrtps-cpp", "ros-sensor-msgs", "ros-std-srvs")
+_WHEELS = ("ros-rclpy", "ros-rmw-fastrtps-cpp", "ros-sensor-msgs", "ros-std-srvs", "ros-diagnostic-msgs")
 """Wheels with ROS 2 for Python on Linux, from PyPI."""
 
 
@@ -425,7 +449,7 @@ def serve_ros(
     """Run a node of ROS 2 that records or plays scans and publishes their points; Ctrl-C ends it.
 
     The node ``uwlts`` publishes the points of each laser image on ``points`` (docs: ros). Its services ``~/start``,
-    ``~/stop`` and ``~/laser_off`` are of the type std_srvs/Trigger.
+    ``~/stop`` and ``~/laser_off`` are of the type std_srvs/Trigger. Its state is on ``/diagnostics`` once a second.
 
     Parameters
     ----------
@@ -459,7 +483,7 @@ def serve_ros(
     known, advice = resolve_calibration(calibration), None
     if pose_std_mm is not None or pose_std_deg is not None:
         advice = PassAdvice(known, pose_std_mm=pose_std_mm, pose_std_deg=pose_std_deg)
-    rclpy, executors, sensor, std, builtin, services, geometry = _import_ros()
+    rclpy, executors, sensor, std, builtin, services, geometry, diagnostic, interfaces = _import_ros()
     played = not isinstance(scans, ScanPlan) and Path(scans).suffix in CAPTURES
     source = scans if isinstance(scans, ScanPlan) else Path(scans) if played else load_plan(Path(scans))
     with ExitStack() as stack:
@@ -492,11 +516,39 @@ def serve_ros(
         stack.callback(service.close)
         for name in ("start", "stop", "laser_off"):
             node.create_service(services.Trigger, f"~/{name}", _answer(getattr(service, name)))
+        fixed = interfaces.ParameterDescriptor(read_only=True)
+        for name, value in {"scans": scans, "calibration": calibration, "folder": folder, "frame_id": frame_id}.items():
+            node.declare_parameter(name, str(value), fixed)
+        states = node.create_publisher(diagnostic.DiagnosticArray, "/diagnostics", _QUEUED)
+
+        def diagnose() -> None:
+            stamp = node.get_clock().now().to_msg()
+            states.publish(_diagnose(service.state, known, diagnostic, stamp))
+
+        node.create_timer(_STATE_S, diagnose)
         node.get_logger().info("ready: start, stop and laser_off are services of the node")
         try:
             rclpy.spin(node)
         except executors.ExternalShutdownException as ended:
             raise KeyboardInterrupt from ended  # rclpy turns Ctrl-C into this
+
+
+def _diagnose(state: ServiceState, calibration: AnyCalibration, messages: Any, stamp: Any) -> Any:
+    """Return the state of a scan as a DiagnosticArray."""
+    kinds, array = messages.DiagnosticStatus, messages.DiagnosticArray()
+    levels = {"ok": kinds.OK, "warning": kinds.WARN, "error": kinds.ERROR}
+    array.header.stamp = stamp
+    values = {"laser images": state.images, "points": state.points}
+    array.status = [
+        kinds(
+            level=levels[state.level],
+            name="uwlts: scan",
+            message=state.message,
+            hardware_id=calibration.sensor_name,
+            values=[messages.KeyValue(key=key, value=str(value)) for key, value in values.items()],
+        )
+    ]
+    return array
 
 
 def _place(advice: PassAdvice, message: Any) -> None:
@@ -531,6 +583,8 @@ def _import_ros() -> tuple[Any, ...]:
             import_module("builtin_interfaces.msg"),
             import_module("std_srvs.srv"),
             import_module("geometry_msgs.msg"),
+            import_module("diagnostic_msgs.msg"),
+            import_module("rcl_interfaces.msg"),
         )
     except ImportError as error:
         raise SetupError(

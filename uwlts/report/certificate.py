@@ -18,7 +18,7 @@ from uwlts.calibration.joint.observability import (
 )
 from uwlts.calibration.joint.stored_estimate import require_joint
 from uwlts.errors import CaptureError
-from uwlts.files.json_files import SEAL, compute_seal, numbers_in, read_json
+from uwlts.files.json_files import SEAL, compute_seal, read_json
 from uwlts.files.writing import hash_file
 from uwlts.fitting.next_observation import Forecast
 from uwlts.model.calibration import Calibration, calibration_digest
@@ -89,7 +89,6 @@ FORMAT = "uwlts-certificate"
 VERSION = 1  # of the file format
 # Number of best shots listed, in addition to the best one of each kind.
 _BEST_SHOTS = 3
-NOT_JOINT = "the calibration was not estimated jointly: the uncertainty of lengths measured by it is not known"
 
 
 def read_certificate(path: str | Path) -> dict[str, JsonValue]:
@@ -151,13 +150,6 @@ class CertifiedFile(Description):
     software: JsonValue
 
 
-class CalibratedMedium(Description):
-    """A medium and its refractive index."""
-
-    medium: _Medium
-    index: float
-
-
 class Validity(Description):
     """A region covered by the evidence: its medium, refractive index and extent."""
 
@@ -183,7 +175,10 @@ class NextShot(Description):
 
 
 class Certificate(Description):
-    """Common content of all certificates. Fields that are not set are omitted from the file."""
+    """Certificate of a joint calibration; without a covered area (see ``remark``), lengths are not certified.
+
+    Fields that are not set are omitted from the file.
+    """
 
     format: str
     version: int
@@ -194,16 +189,6 @@ class Certificate(Description):
     wavelength_nm: float
     made_from: dict[str, JsonValue]
     parameters: tuple[ParameterRow, ...]
-    uncertainty_known: bool
-
-    def in_file(self) -> dict[str, JsonValue]:
-        """Return the content as plain JSON with the keys of files."""
-        return self.model_dump(mode="json", by_alias=True, exclude_unset=True)
-
-
-class JointCertificate(Certificate):
-    """Certificate of a joint calibration; without a covered area (see ``remark``), lengths are not certified."""
-
     validity: tuple[Validity, ...]
     scatter_px: dict[str, float]
     shared_variance: dict[str, float]
@@ -218,26 +203,18 @@ class JointCertificate(Certificate):
     next_shots: tuple[NextShot, ...] = ()
     sha256: str = ""
 
-
-class SequentialCertificate(Certificate):
-    """Certificate of a sequential calibration, which does not provide the uncertainty of lengths."""
-
-    remark: str
-    use: str
-    media: tuple[CalibratedMedium, ...]
-    residuals: dict[str, dict[str, int | float]]
-    sha256: str = ""
+    def in_file(self) -> dict[str, JsonValue]:
+        """Return the content as plain JSON with the keys of files."""
+        return self.model_dump(mode="json", by_alias=True, exclude_unset=True)
 
 
-AnyCertificate = JointCertificate | SequentialCertificate
-
-
-def make_certificate(calibration: Calibration, path: str | Path, *, issued: str) -> AnyCertificate:
+def make_certificate(calibration: Calibration, path: str | Path, *, issued: str) -> Certificate:
     """Return the sealed content of the certificate of a calibration file, issued at a time in ISO 8601.
 
-    CalibrationError if the joint estimate is damaged.
+    CalibrationError if the calibration is not a joint one, or its estimate is damaged.
     """
-    base = Certificate(
+    joint, found = require_joint(calibration), list_regions(calibration)
+    content = Certificate(
         format=FORMAT,
         version=VERSION,
         sensor=calibration.sensor_name,
@@ -253,17 +230,36 @@ def make_certificate(calibration: Calibration, path: str | Path, *, issued: str)
         wavelength_nm=calibration.wavelength_nm,
         made_from=calibration.provenance,
         parameters=parameter_rows(calibration),
-        uncertainty_known=calibration.joint is not None,
+        validity=tuple(_validity(prepare_use(calibration, region)) for region in found),
+        scatter_px=joint.scatter_px,
+        shared_variance=joint.shared_variance,
+        residuals=joint.residual_count,
+        strays=joint.outlier_count,
+        images=joint.images,
     )
-    content = (_complete_sequential if calibration.joint is None else _complete_joint)(base, calibration)
+    if not found or not found[0].has_area():
+        no_area = "the stripes of the evidence cover no area: the uncertainty of lengths is not known"
+        none = "the calibration does not state which volume its evidence covers: calibrate again"
+        added: dict[str, object] = {"remark": no_area if found else none}
+    else:
+        use = prepare_use(calibration, found[0])
+        lengths, known = compute_mesh_lengths(use.known, found[0]), use.known
+        weak = find_weaknesses(lengths, known.parameters.keys, known.covariance)
+        added = {
+            "lengths": tuple(length_uncertainties(use)),
+            "lengths_std_mm": float(np.sqrt(np.mean(lengths.std_mm(known.covariance) ** 2))),
+            "cannot_tell": tuple(format_weaknesses(weak)),
+            "weaknesses": tuple(weak),
+            "next_shots": _shots(rank_next_shots(calibration)),
+        }
+    content = content.model_copy(update=added)
     return content.model_copy(update={SEAL: compute_seal(content.in_file())})
 
 
-def certificate_lines(content: AnyCertificate) -> list[str]:
+def certificate_lines(content: Certificate) -> list[str]:
     """Return the main statements of a certificate for the terminal."""
     if content.remark is not None:
         return [content.remark]
-    assert isinstance(content, JointCertificate)
     longest, volume = {row.axis: row for row in content.lengths}, content.validity[0]
     near, far = volume.camera_depth_mm
     lengths = [
@@ -275,51 +271,6 @@ def certificate_lines(content: AnyCertificate) -> list[str]:
         *content.cannot_tell,
         *(f"next: {shot.advice}" for shot in content.next_shots[:1]),
     ]
-
-
-def _complete_sequential(base: Certificate, calibration: Calibration) -> SequentialCertificate:
-    window = calibration.window
-    rms = {}
-    for step in calibration.residuals:
-        figures = numbers_in(calibration.figures(step)).items()
-        if shown := {key: value for key, value in figures if key in ("rms_px", "rms_mm", "max_mm", "images")}:
-            rms[step] = shown
-    return SequentialCertificate(
-        **dict(base),
-        remark=NOT_JOINT,
-        use=f"in {calibration.medium_kind} only" if window is None else "in air and in water",
-        media=tuple(CalibratedMedium(medium=found.medium, index=found.index) for found in calibration.media),
-        residuals=rms,
-    )
-
-
-def _complete_joint(base: Certificate, calibration: Calibration) -> JointCertificate:
-    joint, found = require_joint(calibration), list_regions(calibration)
-    content = JointCertificate(
-        **dict(base),
-        validity=tuple(_validity(prepare_use(calibration, region)) for region in found),
-        scatter_px=joint.scatter_px,
-        shared_variance=joint.shared_variance,
-        residuals=joint.residual_count,
-        strays=joint.outlier_count,
-        images=joint.images,
-    )
-    if not found or not found[0].has_area():
-        no_area = "the stripes of the evidence cover no area: the uncertainty of lengths is not known"
-        none = "the calibration does not state which volume its evidence covers: calibrate again"
-        return content.model_copy(update={"remark": no_area if found else none})
-    use = prepare_use(calibration, found[0])
-    lengths, known = compute_mesh_lengths(use.known, found[0]), use.known
-    weak = find_weaknesses(lengths, known.parameters.keys, known.covariance)
-    return content.model_copy(
-        update={
-            "lengths": tuple(length_uncertainties(use)),
-            "lengths_std_mm": float(np.sqrt(np.mean(lengths.std_mm(known.covariance) ** 2))),
-            "cannot_tell": tuple(format_weaknesses(weak)),
-            "weaknesses": tuple(weak),
-            "next_shots": _shots(rank_next_shots(calibration)),
-        }
-    )
 
 
 def _shots(forecasts: Sequence[Forecast]) -> tuple[NextShot, ...]:

@@ -30,7 +30,7 @@ from uwlts.pages.toolkit import (
     render_page,
     write_page,
 )
-from uwlts.report.certificate import AnyCertificate, JointCertificate, ParameterRow, make_certificate, parameter_rows
+from uwlts.report.certificate import Certificate, ParameterRow, make_certificate, parameter_rows
 from uwlts.report.certificate_volume import (
     LengthUncertainty,
     compare_calibrations,
@@ -57,13 +57,13 @@ def write_certificate(
     before: str | Path | None = None,
     administration: str | Path | None = None,
     overwrite: bool = False,
-) -> tuple[Path, AnyCertificate]:
+) -> tuple[Path, Certificate]:
     """Write the certificate of a calibration: a page to read and print, and its content as sealed JSON.
 
     Parameters
     ----------
     calibration : str or Path
-        Calibration file; only a joint calibration has uncertainties.
+        File of a joint calibration.
     out : str or Path, optional
         Page to write (default: CALIBRATION.certificate.html). The JSON is written beside it.
     before : str or Path, optional
@@ -76,7 +76,7 @@ def write_certificate(
 
     Returns
     -------
-    (Path, JointCertificate or SequentialCertificate)
+    (Path, Certificate)
         The page and the content of both files.
 
     Raises
@@ -86,7 +86,7 @@ def write_certificate(
     CaptureError
         A calibration cannot be read.
     CalibrationError
-        The joint estimate is damaged, or the other calibration is of another sensor.
+        The calibration is not a joint one, its estimate is damaged, or the other calibration is of another sensor.
     DescriptionError
         The administrative data are not valid.
     """
@@ -110,7 +110,7 @@ def write_certificate(
 
 
 def certificate_page(
-    content: AnyCertificate,
+    content: Certificate,
     calibration: Calibration,
     *,
     before: tuple[str, Calibration] | None = None,
@@ -135,14 +135,12 @@ def certificate_page(
         before=None if before is None else before[0],
         equipment=administration.equipment if administration is not None else (),
         traceability=state_traceability(content, administration)[1],
-        lengths=_length_rows(content.lengths) if isinstance(content, JointCertificate) else [],
-        drawn=_pictures(content, calibration, before) if isinstance(content, JointCertificate) else {},
+        lengths=_length_rows(content.lengths),
+        drawn=_pictures(content, calibration, before),
     )
 
 
-def _pictures(
-    content: JointCertificate, calibration: Calibration, before: tuple[str, Calibration] | None
-) -> dict[str, Any]:
+def _pictures(content: Certificate, calibration: Calibration, before: tuple[str, Calibration] | None) -> dict[str, Any]:
     """Return the charts of the page by name.
 
     ``worst`` are the images with the largest residuals relative to their kind.

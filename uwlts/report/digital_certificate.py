@@ -18,7 +18,7 @@ from uwlts.errors import CaptureError, EvaluationError
 from uwlts.files.reading import read_text
 from uwlts.model.library import read_table, validate_description
 from uwlts.model.sensor import Description
-from uwlts.report.certificate import AnyCertificate, JointCertificate
+from uwlts.report.certificate import Certificate
 
 DCC, SI = "https://ptb.de/dcc", "https://ptb.de/si"
 SCHEMA_VERSION = "3.2.0"
@@ -117,16 +117,15 @@ class Administration(Description):
         return self
 
 
-def state_traceability(content: AnyCertificate, administration: Administration | None) -> tuple[bool, str]:
+def state_traceability(content: Certificate, administration: Administration | None) -> tuple[bool, str]:
     """Return whether the calibration is traceable by its stated equipment, and a sentence.
 
     Traceability needs a statement, and a certificate of each piece of equipment that the calibration used.
     """
     used = ["target"] if content.made_from.get("target") else []
     used += ["step standard"] if content.made_from.get("step_captures") else []
-    media = content.validity if isinstance(content, JointCertificate) else content.media
     # An index that follows from the temperature rests on a thermometer.
-    used += ["thermometer"] if any(each.medium.kind in ("fresh", "sea") for each in media) else []
+    used += ["thermometer"] if any(each.medium.kind in ("fresh", "sea") for each in content.validity) else []
     equipment = () if administration is None else administration.equipment
     certified = {each.role for each in equipment if each.certificate is not None}
     missing = [f"no certificate of the {role}" for role in used if role not in certified]
@@ -143,7 +142,7 @@ def load_administration(path: str | Path) -> Administration:
     return validate_description(Administration, read_table(Path(path)), path)
 
 
-def digital_certificate(content: AnyCertificate, administration: Administration) -> str:
+def digital_certificate(content: Certificate, administration: Administration) -> str:
     """Return a certificate as the text of a digital calibration certificate (XML).
 
     EvaluationError if the certificate has a unit that D-SI does not have.
@@ -160,7 +159,7 @@ def digital_certificate(content: AnyCertificate, administration: Administration)
     )
 
 
-def _add_administration(parent: ET.Element, content: AnyCertificate, stated: Administration) -> None:
+def _add_administration(parent: ET.Element, content: Certificate, stated: Administration) -> None:
     software = _child(_child(parent, "dccSoftware"), "software")
     program, _, release = content.software.partition(" ")
     _text(software, "name", program)
@@ -203,28 +202,26 @@ def _add_administration(parent: ET.Element, content: AnyCertificate, stated: Adm
         _text(_child(statements, "statement"), "declaration", text)
 
 
-def _statements(content: AnyCertificate) -> Iterator[str]:
+def _statements(content: Certificate) -> Iterator[str]:
     yield (
         "Uncertainties are expanded uncertainties with the coverage factor k = 2, for a coverage probability of about "
         "95 % with a normal distribution (GUM, JCGM 100:2008)."
     )
     if content.remark is not None:
         yield content.remark
-    if isinstance(content, JointCertificate):
-        yield "Lengths are valid in the volume that the evidence of the calibration covers, which is stated."
-        yield from content.cannot_tell
+    yield "Lengths are valid in the volume that the evidence of the calibration covers, which is stated."
+    yield from content.cannot_tell
 
 
-def _add_results(parent: ET.Element, content: AnyCertificate, stated: Administration) -> None:
+def _add_results(parent: ET.Element, content: Certificate, stated: Administration) -> None:
     _text(parent, "name", f"Calibration of {content.sensor}")
     method = _child(_child(parent, "usedMethods"), "usedMethod")
     method.set("refType", "basic_methodMeasurementUncertainty")
-    joint = isinstance(content, JointCertificate)
-    _text(method, "name", "joint calibration of camera, window and laser sheet" if joint else "sequential calibration")
+    _text(method, "name", "joint calibration of camera, window and laser sheet")
     _child(method, "norm", "JCGM 100:2008")
     if stated.equipment:
         _add_equipment(_child(parent, "measuringEquipments"), stated)
-    if joint and content.validity:
+    if content.validity:
         _add_medium(_child(parent, "influenceConditions"), content)
     results = _child(parent, "results")
     parameters = _result(results, "Parameters")
@@ -233,11 +230,6 @@ def _add_results(parent: ET.Element, content: AnyCertificate, stated: Administra
             raise EvaluationError(f"the unit {row.unit!r} of {row.name} is none of {', '.join(map(repr, UNITS))}")
         text = f"{row.words} ({row.name}){' in pixels' if row.unit == 'px' else ''}"
         _quantity(parameters, text, row.value, UNITS[row.unit], None if row.std is None else 2 * row.std)
-    if isinstance(content, JointCertificate):
-        _add_lengths_and_volume(results, content)
-
-
-def _add_lengths_and_volume(results: ET.Element, content: JointCertificate) -> None:
     if content.lengths:
         lengths = _result(results, "Lengths measured on surfaces of many points")
         points = _result(results, "Lengths between two single points")
@@ -274,7 +266,7 @@ def _add_equipment(parent: ET.Element, stated: Administration) -> None:
                     _identify(identifications, issuer, value, text, kind)
 
 
-def _add_medium(parent: ET.Element, content: JointCertificate) -> None:
+def _add_medium(parent: ET.Element, content: Certificate) -> None:
     for region in content.validity:
         condition = _child(parent, "influenceCondition")
         _text(condition, "name", f"medium {region.name}: {region.medium.kind}")

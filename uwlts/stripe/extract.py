@@ -38,49 +38,56 @@ MEDIAN_SURROUNDINGS = NormalDist().inv_cdf(1.0 - (1.0 - math.sqrt(0.5)) ** 0.5)
 """Median of max(min(a, b), min(c, d)) for unit Gaussian noise: each minimum is below x with 1 - (1 - P(x))^2."""
 
 
-def block_extremes(profiles: np.ndarray, block: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the maximum and the background of each block of profiles (N, L), as two arrays (ceil(N / block), L).
+def block_contrast(profiles: np.ndarray, block: int, clip: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the contrasts (B + 2 `MARGIN`, L) of the B blocks of profiles (N, L), with zeros at both ends.
 
-    The background is the smaller of two pixels half a block apart, which a single hot pixel does not raise. The last
-    block of a line may be smaller.
+    A contrast is the non-negative height of a block above its surroundings, grey levels. The background of a block is
+    the smaller of two pixels half a block apart, which a single hot pixel does not raise. The last block of a line may
+    be smaller.
+
+    The second array (L,) is True for lines with a block whose background is ``clip`` or more. The contrast of such a
+    plateau is zero if it is wider than the window.
     """
-    high, low = np.empty((2, math.ceil(profiles.shape[0] / block), profiles.shape[1]), profiles.dtype)
-    _fill_extremes(profiles, block, high, low)
-    return high, low
+    blocks, lines = math.ceil(profiles.shape[0] / block), profiles.shape[1]
+    high, low = np.empty((2, blocks, lines), profiles.dtype)
+    board, brightest = np.zeros((blocks + 2 * MARGIN, lines), profiles.dtype), np.zeros(lines, profiles.dtype)
+    _fill_contrasts(profiles, block, (high, low), board[MARGIN:-MARGIN], brightest)
+    return board, brightest >= clip
 
 
 @compiled
-def _fill_extremes(profiles: np.ndarray, block: int, high: np.ndarray, low: np.ndarray) -> None:
-    """Fill the extremes of `block_extremes` in the order of the pixels in memory, which limits the speed."""
-    count = profiles.shape[0]
-    for first in range(0, count, block):
-        largest, least = high[first // block], low[first // block]
-        middle = first + min(block, count - first) // 2
-        for n in range(first, min(first + block, count)):
-            pixels = profiles[n]
-            if n == first:
-                for k in range(pixels.size):
-                    largest[k] = least[k] = pixels[k]
-            elif n == middle:
-                for k in range(pixels.size):
-                    largest[k], least[k] = max(largest[k], pixels[k]), min(least[k], pixels[k])
-            else:
-                for k in range(pixels.size):
-                    largest[k] = max(largest[k], pixels[k])
+def _fill_contrasts(
+    profiles: np.ndarray,
+    block: int,
+    buffers: tuple[np.ndarray, np.ndarray],
+    contrast: np.ndarray,
+    brightest: np.ndarray,
+) -> None:
+    """Fill the contrasts of `block_contrast` and the brightest background (L,), in the pixels' order in memory.
 
-
-def block_contrast(high: np.ndarray, low: np.ndarray, *, out: np.ndarray) -> np.ndarray:
-    """Return the non-negative height of each block above its surroundings, grey levels; arrays as in `block_extremes`.
-
-    At the ends of a line only one side has surroundings, which are used alone.
+    ``buffers`` are maximum and background (B, L) of each block. At the ends of a line only one side has surroundings,
+    which are used alone.
     """
-    surroundings = np.empty_like(low)
-    np.maximum(low[:-4], low[4:], out=surroundings[2:-2])
-    surroundings[:2] = low[2:4]
-    surroundings[-2:] = low[-4:-2]
-    # OpenCV's difference of unsigned integers saturates at 0.
-    cv2.subtract(high, surroundings, dst=out)
-    return out if out.dtype.kind == "u" else np.maximum(out, 0, out=out)
+    (high, low), count = buffers, profiles.shape[0]
+    for number in range(high.shape[0] + 2):
+        first, end = number * block, min(number * block + block, count)
+        for n in range(first, end):
+            pixels, largest = profiles[n], high[number]
+            for k in range(pixels.size):
+                largest[k] = pixels[k] if n == first else max(largest[k], pixels[k])
+        if first < end:
+            start, middle, least = profiles[first], profiles[(first + end) // 2], low[number]
+            for k in range(least.size):
+                least[k] = min(start[k], middle[k])
+        # The blocks on both sides of the block before the previous one are known by now.
+        done, last = number - 2, high.shape[0] - 1
+        if done >= 0:
+            largest, least, heights = high[done], low[done], contrast[done]
+            before, after = low[done - 2 if done >= 2 else number], low[number if number <= last else done - 2]
+            for k in range(heights.size):
+                ground = max(before[k], after[k])
+                heights[k] = max(largest[k], ground) - ground
+                brightest[k] = max(brightest[k], least[k])
 
 
 def noise_from_contrast(contrast: np.ndarray, block: int) -> float:
@@ -90,13 +97,13 @@ def noise_from_contrast(contrast: np.ndarray, block: int) -> float:
     stripe. For a background clipped at black, this estimate is more accurate than the deviation of single pixels.
     """
     sample = contrast.ravel()[:: max(1, contrast.size // _NOISE_SAMPLES)].copy()
-    sample.partition(sample.size // 2)
+    sample.sort()
     middle = sample[sample.size // 2]
     median = float(middle)
     if contrast.dtype.kind in "iu":
         # The median of integers is quantised: interpolate the cumulative histogram linearly.
-        below, equal = np.count_nonzero(sample < middle), np.count_nonzero(sample == middle)
-        median += (0.5 * sample.size - below) / equal - 0.5
+        below, end = sample.searchsorted(middle), sample.searchsorted(middle, side="right")
+        median += (0.5 * sample.size - below) / (end - below) - 0.5
     return max(median, 0.0) / _median_contrast(block)
 
 
@@ -406,8 +413,8 @@ class _SearchedImage:
         """
         lines = np.flatnonzero(self.several | self.wide)
         known = (self.stripe.status[lines] != _OK) | self.wide[lines]
-        lines = lines[mark_rivals(self.profiles, self.left, lines, known, self.rules)]
-        found = self.find_candidates(lines, rivals=True) if len(lines) else None
+        mark_rivals(self.profiles, self.left, lines, self.rules, known)
+        found = self.find_candidates(lines[known], rivals=True) if known.any() else None
         return found if found is not None and len(found.line) else None
 
     def find_candidates(self, lines: np.ndarray, *, rivals: bool = False) -> StripeCandidates:
@@ -435,18 +442,14 @@ def _search_profiles(
 ) -> _SearchedImage:
     """Search the profiles (N, L) with one window size; ``clipped`` (N, L) is None if ``clip`` distinguishes pixels."""
     block = options.half_window_px // 2
-    high, low = block_extremes(profiles, block)
-    # Extra blocks at both ends of the lines: the blocks of a window can be cleared without range checks.
-    board = np.zeros((high.shape[0] + 2 * MARGIN, high.shape[1]), high.dtype)
-    noise = noise_from_contrast(block_contrast(high, low, out=board[MARGIN:-MARGIN]), block)
+    board, white = block_contrast(profiles, block, clip)
+    noise = noise_from_contrast(board[MARGIN:-MARGIN], block)
     coarse = max(options.threshold_floor, noise * (_Rule.coarse_sigmas - MEDIAN_SURROUNDINGS))
     fine = max(options.threshold_floor, options.threshold_sigmas * noise * noise_gain(options.smoothing_px))
     left, rules = cv2.transpose(board), search_rules(options, coarse=coarse, fine=fine, clip=clip)
     status, wide, several, peak = search_profiles(profiles, left, rules)
-    # The contrast of a plateau wider than the window is zero.
     if clipped is not None:
-        low, clip = block_extremes(clipped, block)[1], 1
-    white = low.max(axis=0) >= clip if low.max() >= clip else np.zeros(len(status), np.bool_)
+        white = block_contrast(clipped, block, 1)[1]
     centre, amplitude = place_centre(options.method, peak)
     columns = peak.start + centre.astype(np.float64), amplitude, peak.sigma * FWHM_PER_SIGMA
     stripe = Stripe.from_lines(np.flatnonzero(status == _OK), *columns, status=status, stripe_along=along)

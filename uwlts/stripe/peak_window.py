@@ -9,7 +9,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from uwlts.runtime.compiled import compiled, compiled_inline, compiled_part
+from uwlts.runtime.compiled import compiled_inline, compiled_part
 
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 """Full width at half maximum of a Gaussian, divided by its standard deviation."""
@@ -40,6 +40,9 @@ WINDOW_RULE = WindowRule()
 FIRST = -1  # order of `SearchRules` for the rule `PeakRule.FIRST`
 STRONGEST = 0  # order of `SearchRules` for the rules `PeakRule.STRONGEST` and `PeakRule.DIRECT`
 LAST = 1  # order of `SearchRules` for the rule `PeakRule.LAST`
+
+
+_PAIRS = 4  # pairs of weights of the low-pass in one pass over a window
 
 
 class SearchRules(NamedTuple):
@@ -128,21 +131,26 @@ def cut_window(profiles: np.ndarray, line: int, start: int, out: np.ndarray) -> 
 
 
 @compiled_part
-def filter_window(pixels: np.ndarray, kernel: np.ndarray, out: np.ndarray) -> None:
-    """Filter a window with a symmetric low-pass of 2 R + 1 weights.
+def filter_window(pixels: np.ndarray, size: int, kernel: np.ndarray, out: np.ndarray) -> None:
+    """Filter a window of ``size`` pixels with a symmetric low-pass of 2 R + 1 weights (`low_pass`).
 
-    ``pixels`` has R further elements on either side, which are overwritten with the window's border pixels.
+    ``pixels`` has R further elements on either side, which are overwritten with the window's border pixels. Elements of
+    ``out`` beyond the window's size have no meaning; they fill vector units.
     """
-    size, reach = out.size, kernel.size // 2
-    middle = pixels[reach : reach + size]
+    reach = kernel.size // 2
+    middle, behind, weight = pixels[reach:], pixels[reach + size :], kernel[reach]
+    first, last = middle[0], middle[size - 1]
     for k in range(reach):
-        pixels[k], pixels[reach + size + k] = middle[0], middle[size - 1]
-    for k in range(size):
-        out[k] = kernel[reach] * middle[k]
-    for j in range(reach):
-        before, after = pixels[j : j + size], pixels[2 * reach - j : 2 * reach - j + size]
-        for k in range(size):
-            out[k] += kernel[j] * (before[k] + after[k])
+        pixels[k], behind[k] = first, last
+    for k in range(out.size):
+        out[k] = weight * middle[k]
+    # Four pairs of weights in one pass: more passes over so few pixels would take longer.
+    for j in range(0, reach, _PAIRS):
+        before, after = pixels[j:], pixels[2 * reach - j - _PAIRS + 1 :]
+        w0, w1, w2, w3 = kernel[j], kernel[j + 1], kernel[j + 2], kernel[j + 3]
+        for k in range(out.size):
+            outer = w0 * (before[k] + after[k + 3]) + w1 * (before[k + 1] + after[k + 2])
+            out[k] += outer + w2 * (before[k + 2] + after[k + 1]) + w3 * (before[k + 3] + after[k])
 
 
 @compiled_part
@@ -253,10 +261,10 @@ def _flank(smooth: np.ndarray, first: int) -> np.float32:
 
 @lru_cache(maxsize=16)
 def low_pass(sigma: float) -> np.ndarray:
-    """Return Gaussian weights of sum 1."""
+    """Return Gaussian weights of sum 1, with zeros at both ends for a reach of a multiple of `_PAIRS`."""
     reach = math.ceil(WINDOW_RULE.low_pass * sigma)
     weight = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
-    return (weight / weight.sum()).astype(np.float32)
+    return np.pad(weight / weight.sum(), -reach % _PAIRS).astype(np.float32)
 
 
 @lru_cache(maxsize=16)
@@ -265,22 +273,26 @@ def noise_gain(sigma: float) -> float:
     return float(np.sqrt(np.sum(low_pass(sigma) ** 2)))
 
 
-@compiled
-def gaussian_moments(peak: PeakWindow, centre: np.ndarray, sigma: np.ndarray, moments: np.ndarray) -> None:
-    """Compute moments M0, M1, M2 (M, 3) of the windows above `base`, weighted at `centre`; see `zero_crossing`."""
-    half, last = np.float32(0.5), peak.window.shape[1] - 1
-    for m in range(centre.size):
-        ground, middle, inverse = peak.base[m], centre[m], np.float32(1.0) / sigma[m]
-        # The centre may be outside its window.
-        reach, near = math.ceil(np.float32(WINDOW_RULE.tail) * sigma[m]), min(max(math.floor(middle + half), 0), last)
-        first, end = max(near - reach, 0), min(near + reach, last) + 1
-        pixels, start = peak.window[m, first:end], np.float32(first) - middle
-        m0, m1, m2 = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-        for k in range(pixels.size):
-            t = (start + np.float32(k)) * inverse
-            value = exponential(-half * t * t) * (pixels[k] - ground)
-            m0, m1, m2 = m0 + value, m1 + value * t, m2 + value * t * t
-        moments[m, 0], moments[m, 1], moments[m, 2] = m0, m1, m2
+@compiled_part
+def gaussian_moments(
+    peak: PeakWindow, number: int, centre: np.float32
+) -> tuple[np.float32, np.float32, np.float32, np.float32]:
+    """Return moments M0, M1, M2 of a window above `base`, weighted at ``centre``, and the weight's sigma.
+
+    See `uwlts.stripe.methods.zero_crossing` for the moments.
+    """
+    sigma = max(peak.sigma[number], np.float32(WINDOW_RULE.least_kernel))
+    half, last, inverse = np.float32(0.5), peak.window.shape[1] - 1, np.float32(1.0) / sigma
+    # The centre may be outside its window.
+    reach, near = math.ceil(np.float32(WINDOW_RULE.tail) * sigma), min(max(math.floor(centre + half), 0), last)
+    first, end = max(near - reach, 0), min(near + reach, last) + 1
+    pixels, start, ground = peak.window[number, first:end], np.float32(first) - centre, peak.base[number]
+    m0, m1, m2 = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    for k in range(pixels.size):
+        t = (start + np.float32(k)) * inverse
+        value = exponential(-half * t * t) * (pixels[k] - ground)
+        m0, m1, m2 = m0 + value, m1 + value * t, m2 + value * t * t
+    return m0, m1, m2, sigma
 
 
 @compiled_part

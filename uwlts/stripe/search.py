@@ -50,6 +50,8 @@ class _SearchRule(NamedTuple):
 
 _RULE = _SearchRule()
 
+_FILLED = 32  # buffers of a window are a multiple of this number of pixels, which fills vector units
+
 MARGIN = 2  # blocks on either side of its own block that a window covers
 
 _OK = int(StripeStatus.OK)
@@ -109,8 +111,8 @@ class _Buffers(NamedTuple):
 
 
 def _make_buffers(peaks: PeakWindow) -> _Buffers:
-    kernel, size = low_pass(peaks.smoothing), peaks.window.shape[1]
-    return _Buffers(kernel, np.empty(size + kernel.size - 1, np.float32), np.empty(size, np.float32))
+    kernel, size = low_pass(peaks.smoothing), -(-peaks.window.shape[1] // _FILLED) * _FILLED
+    return _Buffers(kernel, np.zeros(size + kernel.size - 1, np.float32), np.empty(size, np.float32))
 
 
 def search_all(
@@ -136,16 +138,14 @@ def search_all(
 
 
 def mark_rivals(
-    profiles: np.ndarray, left: np.ndarray, lines: np.ndarray, known: np.ndarray, rules: SearchRules
-) -> np.ndarray:
-    """Return a mask (M,) of the profile lines ``lines`` (M,) that have a block of high contrast left.
+    profiles: np.ndarray, left: np.ndarray, lines: np.ndarray, rules: SearchRules, found: np.ndarray
+) -> None:
+    """Mark the profile lines ``lines`` (M,) in ``found`` (M,) that have a block of high contrast left.
 
     ``left`` (L, B + 2 `MARGIN`) contains the contrasts of the remaining blocks of all lines of the profiles (N, L);
-    spikes are ignored. Lines that are ``known`` (M,) are marked already and not examined.
+    spikes are ignored. Lines that are marked already are not examined.
     """
-    found = known.copy()
     _mark_rivals(profiles, left, lines, np.empty(rules.block + 2, np.float32), rules, found)
-    return found
 
 
 @compiled
@@ -160,7 +160,7 @@ def _search_lines(
     """Fill status, wide, several (``marks``) and the windows; return the number of lines with a stripe."""
     status, wide, several = marks
     # Not a literal, which Numba would compile further specialisations for.
-    size, border, count = buffers.smooth.size, buffers.kernel.size // 2, int(np.intp(0))
+    size, border, count = peaks.window.shape[1], buffers.kernel.size // 2, int(np.intp(0))
     window = buffers.pixels[border : border + size]
     near = window[rules.half - 1 : rules.half + rules.block + 1]
     for line in range(profiles.shape[1]):
@@ -236,7 +236,7 @@ def _search_all(
 ) -> int:
     """Fill `found`, `clear` and the windows of all stripes on the given lines; return the number of stripes."""
     # Not a literal, which Numba would compile further specialisations for.
-    size, border, count = buffers.smooth.size, buffers.kernel.size // 2, int(np.intp(0))
+    size, border, count = peaks.window.shape[1], buffers.kernel.size // 2, int(np.intp(0))
     window = buffers.pixels[border : border + size]
     near = window[rules.half - 1 : rules.half + rules.block + 1]
     for m in range(lines.size):
@@ -296,11 +296,11 @@ def _follow_peak(
     offset = 0
     while True:
         cut_window(profiles, line, start + offset, window)
-        filter_window(pixels, kernel, smooth)
-        peak = measure_peak(smooth, start + offset, profiles.shape[0], rules)
+        filter_window(pixels, window.size, kernel, smooth)
+        peak = measure_peak(smooth[: window.size], start + offset, profiles.shape[0], rules)
         if offset != 0:
             break
-        offset = _find_offset(peak, smooth.size, rules)
+        offset = _find_offset(peak, window.size, rules)
         if offset == 0:
             break
     return start + offset, peak
@@ -366,15 +366,10 @@ def _choose_block(blocks: np.ndarray, highest: np.number, least: np.float32, rul
         return -1
     if rules.order == STRONGEST:
         return _find_first_equal(blocks, highest)
-    chosen = 0
     wanted = max(least, np.float32(highest) * np.float32(rules.share * _RULE.coarse_slack))
-    if rules.order == FIRST:
-        while blocks[chosen] < wanted:
-            chosen += 1
-        return chosen
-    chosen = blocks.size - 1
+    chosen = 0 if rules.order == FIRST else blocks.size - 1
     while blocks[chosen] < wanted:
-        chosen -= 1
+        chosen += 1 if rules.order == FIRST else -1
     return chosen
 
 

@@ -13,15 +13,12 @@ import numpy as np
 import pytest
 
 import uwlts
-from tests.uwlts.calibration_views import built_sensor
-from tests.uwlts.joint_views import MEDIUM, Noise, gathered, target_series
+from tests.uwlts.joint_views import MEDIUM, joint_calibration
 from tests.uwlts.recalibration.test_recalibration import SENSOR, SHIFTED, WATER, campaign, write_capture
 from tests.waiting import within
 from twin.devices.grbl_controller import GrblController
-from uwlts.calibration.calibrate import solve_jointly
-from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.desk import scan
-from uwlts.desk.scan import PassAdvice, ScanDevices, ScanService
+from uwlts.desk.scan import PassAdvice, ScanDevices, ScanService, ServiceState
 from uwlts.errors import CalibrationError, DescriptionError, HardwareError
 from uwlts.hardware.camera_interface import Delivered, ReplayCamera
 from uwlts.hardware.grbl import GrblStage
@@ -37,19 +34,12 @@ EVERY_S = 0.15
 LASER_ON = (True, True, False, True)
 
 
-def joint_calibration(sensor: Sensor) -> Calibration:
-    noise = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(4))
-    series = target_series(built_sensor(), medium=0, positions=np.arange(6) * 36.0 - 120.0, noise=noise)
-    options = CalibrationOptions(poses="stage", correct_circles=False)
-    return solve_jointly(gathered(sensor, [series]), options=options).calibration
-
-
 @pytest.fixture(scope="module")
 def calibration(thesis: Sensor) -> Calibration:
     return joint_calibration(thesis)
 
 
-def write_images(path: Path, sensor: Sensor, laser_on: tuple[bool, ...]) -> Path:
+def write_images(path: Path, sensor: Sensor, laser_on: tuple[bool, ...], *, peak_dn: float = 150.0) -> Path:
     """Write a capture whose laser images show a stripe at different rows."""
     header = CaptureHeader(
         name="scan", sensor=sensor, medium_name="water", medium=MEDIUM, stage_direction=(1, 0, 0), saturation_dn=255
@@ -58,7 +48,7 @@ def write_images(path: Path, sensor: Sensor, laser_on: tuple[bool, ...]) -> Path
     with CaptureWriter(path, header, dtype=np.uint8) as writer:
         for number, on in enumerate(laser_on):
             rows = np.arange(camera.height_px)[:, None] - (420.3 + 20 * number)
-            image = rng.normal(5, 1, (camera.height_px, camera.width_px)) + 150 * on * np.exp(-0.2 * rows**2)
+            image = rng.normal(5, 1, (camera.height_px, camera.width_px)) + peak_dn * on * np.exp(-0.2 * rows**2)
             writer.append(Frame(image.astype(np.uint8), 2.0 * number, on, 1.0, EVERY_S * number))
     return path
 
@@ -91,6 +81,7 @@ def test_a_played_capture_gives_its_cloud_image_by_image_at_its_speed(capture: P
     with pytest.raises(HardwareError, match="a scan is running"):
         service.start()
     service.wait()
+    assert service.state == ServiceState(said[-1], "ok", len(clouds), sum(map(len, clouds)))
     assert said == [f"played {capture}"] and time.monotonic() - begun_s > EVERY_S * (len(LASER_ON) - 1)
     whole = uwlts.reconstruct(capture, calibration)
     assert len(clouds) == sum(LASER_ON) and len(whole) > 1000
@@ -191,6 +182,23 @@ def test_clocks_that_are_set_during_a_scan_change_neither_times_nor_places(
         assert (np.diff(times) > 0).all() and times[0] >= 0 and times[-1] < time.monotonic() - begun_s
 
 
+def test_a_scan_with_doubts_is_a_warning_of_the_node(tmp_path, thesis, calibration, controller):
+    faint = write_images(tmp_path / "faint.h5", thesis, (True, True), peak_dn=15.0)
+    plan, said = plan_for(tmp_path, controller, faint), []
+    with GrblStage(controller.port) as stage, LoopedReplay(faint) as camera:
+        used = {"folder": tmp_path, "devices": ScanDevices(camera, stage, home=True)}
+        service = ScanService(plan, calibration, Mock(), report=said.append, **used)
+        service.start()
+        service.wait()
+    assert "3 laser images are faint" in service.state.message, said
+    kinds = Mock()
+    scan._diagnose(service.state, calibration, kinds, "now")
+    stated = kinds.DiagnosticStatus.call_args.kwargs
+    assert (stated["level"], stated["hardware_id"]) == (kinds.DiagnosticStatus.WARN, "thesis") and stated[
+        "message"
+    ] == said[-1]
+
+
 def test_a_scan_without_a_pose_is_kept_but_gives_no_advice(tmp_path, lit, calibration, controller):
     said: list[str] = []
     advice = PassAdvice(calibration, pose_std_mm=0.01, pose_std_deg=0.005)
@@ -247,6 +255,7 @@ def test_the_laser_off_service_ends_a_scan_with_the_laser_off(tmp_path, lit, cal
         service.start()
         service.wait()
         assert said[-1].startswith("error: ") and "home" in said[-1]
+        assert (service.state.message, service.state.level, service.state.images) == (said[-1], "error", 0)
         stage.unlock()
 
 
@@ -276,7 +285,7 @@ def test_a_node_of_ros_that_is_interrupted_ends_as_interrupted(capture: Path, ca
     rclpy = SimpleNamespace(
         init=lambda: done.append("init"), try_shutdown=lambda: done.append("end"), spin=spin, create_node=lambda _: node
     )
-    modules = rclpy, SimpleNamespace(ExternalShutdownException=Ended), *(Mock() for _ in range(5))
+    modules = rclpy, SimpleNamespace(ExternalShutdownException=Ended), *(Mock() for _ in range(7))
     monkeypatch.setattr(scan, "_import_ros", lambda: modules)
     with pytest.raises(KeyboardInterrupt):
         scan.serve_ros(capture, calibration=calibration)

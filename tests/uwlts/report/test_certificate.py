@@ -9,23 +9,14 @@ import pytest
 
 import uwlts
 from tests.uwlts.calibration_views import built_sensor
-from tests.uwlts.joint_views import MEDIUM, Noise, gathered, target_series
-from uwlts.calibration.calibrate import solve_jointly
+from tests.uwlts.joint_views import MEDIUM, joint_calibration
 from uwlts.calibration.joint.observability import SheetRegion, list_regions, project_sheet_points, read_region_estimate
-from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError, CaptureError, OutputError
 from uwlts.files.json_files import compute_seal, to_canonical_json
 from uwlts.model.calibration import KnownMedium
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.triangulation import reconstruct_pixels
-from uwlts.report.certificate import (
-    NOT_JOINT,
-    JointCertificate,
-    certificate_lines,
-    check_certificate,
-    make_certificate,
-    read_certificate,
-)
+from uwlts.report.certificate import certificate_lines, check_certificate, make_certificate, read_certificate
 from uwlts.report.certificate_page import certificate_page, write_certificate
 from uwlts.report.certificate_volume import (
     compare_calibrations,
@@ -45,12 +36,8 @@ DRAWS = 300
 
 @pytest.fixture(scope="module")
 def path(thesis, tmp_path_factory):
-    noise = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(4))
-    series = target_series(BUILT, medium=0, positions=np.arange(6) * 36.0 - 120.0, noise=noise, columns=15)
-    options = CalibrationOptions(poses="stage", correct_circles=False)
-    calibration = solve_jointly(gathered(thesis, [series]), options=options).calibration
     path = tmp_path_factory.mktemp("certificate") / "calibration.json"
-    calibration.save(path)
+    joint_calibration(thesis, columns=15).save(path)
     return path
 
 
@@ -284,17 +271,12 @@ def test_the_certificate_is_complete_and_loads_nothing_from_the_network(calibrat
     assert len(text) > 10_000 and "nan" not in text.replace("nanometre", "")
 
 
-def test_a_certificate_without_a_joint_estimate_states_no_uncertainty(thesis, tmp_path):
+def test_only_a_joint_calibration_gets_a_certificate(thesis, tmp_path):
     path = tmp_path / "nominal.json"
     nominal_calibration(thesis).save(path)
-    known = load_calibration(path)
-    content = make_certificate(known, path, issued=ISSUED)
-    assert content.remark == NOT_JOINT
-    assert not content.uncertainty_known
-    assert not isinstance(content, JointCertificate) and "lengths" not in content.in_file()
-    page = certificate_page(content, known)
-    assert NOT_JOINT[1:] in page
-    assert "Uncertainty of lengths" not in page
+    with pytest.raises(CalibrationError, match="calibrate jointly"):
+        write_certificate(path)
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_damaged_volume_is_reported(calibration):

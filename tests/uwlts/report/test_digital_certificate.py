@@ -13,10 +13,11 @@ import pytest
 
 import uwlts
 from tests.system.in_process import run_program
+from tests.uwlts.joint_views import joint_calibration
 from uwlts.cli import app
 from uwlts.errors import CaptureError, DescriptionError, EvaluationError
 from uwlts.model.sensor import Medium
-from uwlts.report.certificate import CertifiedFile, JointCertificate, ParameterRow, Validity
+from uwlts.report.certificate import Certificate, CertifiedFile, ParameterRow, Validity
 from uwlts.report.certificate_volume import LengthUncertainty
 from uwlts.report.digital_certificate import DCC, SI, UNITS, _decimal, digital_certificate, load_administration
 
@@ -139,16 +140,10 @@ def certificate(**changes):
         "made_from": {},
         "parameters": rows,
     }
-    content |= {
-        "uncertainty_known": True,
-        "validity": (volume,),
-        "scatter_px": {},
-        "shared_variance": {},
-        "residuals": 1,
-    }
+    content |= {"validity": (volume,), "scatter_px": {}, "shared_variance": {}, "residuals": 1}
     content |= {"strays": 0, "images": (), "lengths": (LengthUncertainty("Y", 150.0, 0.0118, 0.0306),)}
     content |= {"cannot_tell": ("f is weakly known",), "sha256": "ef" * 32}
-    return JointCertificate.model_validate(content | changes)
+    return Certificate.model_validate(content | changes)
 
 
 def root_of(administration, **changes):
@@ -336,14 +331,14 @@ def test_wrong_administrative_data_are_refused(administration, old, new, said):
         load_administration(administration)
 
 
-def test_the_command_writes_it_beside_the_page(administration, tmp_path):
-    """Also of a calibration without uncertainties, which states so."""
-    uwlts.nominal("thesis", medium="water").save(tmp_path / "water.json")
+def test_the_command_writes_it_beside_the_page(administration, thesis, tmp_path):
+    joint_calibration(thesis).save(tmp_path / "water.json")
     words = ["certificate", tmp_path / "water.json", "--out", tmp_path / "c.html", "--administration", administration]
     done = run_program(app, "uwlts", *words)
     assert done.returncode == 0, done.stderr
     assert done.stdout.endswith(f"wrote {tmp_path / 'c.xml'}\n")
     root = ET.fromstring((tmp_path / "c.xml").read_bytes())
     check_order(root)
-    assert {each for values in quantities(root).values() for *_, each in values} == {None}
+    lengths = [each for name, values in quantities(root).items() if name.startswith("length of") for each in values]
+    assert len(lengths) > 10 and all(expanded > 0 for *_, expanded in lengths)
     assert run_program(app, "uwlts", *words).returncode == 2

@@ -15,7 +15,7 @@ from importlib import import_module
 import numpy as np
 
 from uwlts.runtime.compiled import compiled
-from uwlts.stripe.peak_window import WINDOW_RULE, PeakWindow, exponential
+from uwlts.stripe.peak_window import PeakWindow, gaussian_moments
 
 _ONE_PIXEL = 0.3  # sigma, px, of light within one pixel (1 / sqrt 12, rounded), the narrowest stripe in an image
 
@@ -41,25 +41,9 @@ def place_centre(method: str, peak: PeakWindow) -> tuple[np.ndarray, np.ndarray]
 
 @compiled
 def _best_heights(peak: PeakWindow, centre: np.ndarray, result: np.ndarray) -> None:
-    size = peak.window.shape[1]
     for m in range(centre.size):
-        pixels, ground, middle = peak.window[m], peak.base[m], centre[m]
         sigma = max(peak.sigma[m], np.float32(_ONE_PIXEL))
-        width = max(peak.sigma[m], np.float32(WINDOW_RULE.least_kernel))
-        near = min(max(math.floor(middle + np.float32(0.5)), 0), size - 1)
-        # Gaussian by recurrence on both sides: the ratio of neighbouring values decreases by a constant factor.
-        sharpness, offset, half = np.float32(1.0) / (width * width), np.float32(near) - middle, np.float32(0.5)
-        weight = exponential(-half * sharpness * offset * offset)
-        after, before = exponential(-sharpness * (half + offset)), exponential(-sharpness * (half - offset))
-        falling = after * before
-        total, right, left = weight * (pixels[near] - ground), weight * after, weight * before
-        for k in range(1, math.ceil(np.float32(WINDOW_RULE.tail) * width) + 1):
-            if near + k < size:
-                total += right * (pixels[near + k] - ground)
-            if near - k >= 0:
-                total += left * (pixels[near - k] - ground)
-            after, before = after * falling, before * falling
-            right, left = right * after, left * before
+        total, _, _, width = gaussian_moments(peak, m, centre[m])
         # Sum over the product of two Gaussians, solved for the height of the first.
-        joint = np.float32(0.5 / math.pi) * (np.float32(1.0) / (sigma * sigma) + sharpness)
-        result[m] = total * math.sqrt(joint)
+        inverse = np.float32(1.0) / (sigma * sigma) + np.float32(1.0) / (width * width)
+        result[m] = total * math.sqrt(np.float32(0.5 / math.pi) * inverse)

@@ -364,54 +364,60 @@ def _select_least_scattered(peak: PeakWindow, centre: np.ndarray) -> np.ndarray:
     of M lines in their order.
     """
     rows, others = _select_runs(peak.start.size), (zero_crossing, quadratic, centre_of_mass)
-    # The median of the lines that are compared, because only their scatter decides; counting is faster than sorting.
-    narrow = np.count_nonzero(peak.sigma[rows[::2]] < _Comparison.narrowest)
-    if rows.shape[1] <= 2 * _Comparison.reach or 2 * narrow > rows[::2].size:
+    if rows.shape[1] <= 2 * _Comparison.reach:
         return centre
-    scatter, of_first = _measure_scatters(peak, centre, rows[::2], zero_crossing)
+    some = peak.select(rows[::2].ravel())
+    # The median of the lines that are compared, because only their scatter decides; counting is faster than sorting.
+    if 2 * np.count_nonzero(some.sigma < _Comparison.narrowest) > some.sigma.size:
+        return centre
+    scatter, of_first = _measure_scatters(some, centre, rows[::2], zero_crossing)
     if not of_first <= _Comparison.advantage * scatter:
         return centre
-    scatter, *scatters = _measure_scatters(peak, centre, rows, *others)
+    scatter, *scatters = _measure_scatters(peak.select(rows.ravel()), centre, rows, *others)
     best = int(np.argmin(scatters))
     if not scatter - scatters[best] > max(_Comparison.gain * scatter, _Comparison.gain_px):
         return centre
     return others[best].centres(peak)
 
 
-def _measure_scatters(peak: PeakWindow, centre: np.ndarray, rows: np.ndarray, *others: ModuleType) -> list[float]:
+def _measure_scatters(some: PeakWindow, centre: np.ndarray, rows: np.ndarray, *others: ModuleType) -> list[float]:
     """Return the root mean square distance, px, from parabolas through neighbours: of centres, and of other methods.
 
-    ``rows`` (R, K) are the lines of R runs. The distances are NaN if too few lines belong to a smooth stripe.
+    ``some`` are the peaks of the lines ``rows`` (R, K) of R runs. The distances are NaN if too few lines belong to a
+    smooth stripe.
     """
-    some, weights = peak.select(rows.ravel()), _residual_weights(_Comparison.reach)
-    middle = (some.start + some.middle).reshape(rows.shape).astype(float)
+    weights, jump = _residual_weights(_Comparison.reach), _Comparison.jump * some.window.shape[1]
     scatters = []
     for values in (centre[rows.ravel()], *(other.centres(some) for other in others)):
-        place = (some.start + values.astype(float)).reshape(rows.shape)
-        total, count = _sum_squares(middle, place, weights, _Comparison.jump * peak.window.shape[1])
+        total, count = _sum_squares((some.start, some.middle, values), rows.shape[1], weights, jump)
         scatters.append(math.sqrt(total / count) if count >= _Comparison.fewest else math.nan)
     return scatters
 
 
 @compiled
-def _sum_squares(middle: np.ndarray, place: np.ndarray, weights: np.ndarray, jump_px: float) -> tuple[float, int]:
-    """Return the sum of the squared, limited residuals of places (R, K), and the number of lines on smooth stripes.
+def _sum_squares(
+    places: tuple[np.ndarray, np.ndarray, np.ndarray], run: int, weights: np.ndarray, jump_px: float
+) -> tuple[float, int]:
+    """Return the sum of the squared, limited residuals of centres, and the number of lines on smooth stripes.
 
-    The residual of a line is the sum of its neighbours' places with the weights (2 reach + 1,). A stripe is smooth if
-    the middles (R, K) of neighbouring lines are nowhere farther apart than ``jump_px``.
+    ``places`` (M,) are start, middle and centre on the lines of runs of ``run`` lines. The residual of a line is the
+    sum of its neighbours' places with the weights (2 reach + 1,). A stripe is smooth if the middles of neighbouring
+    lines are nowhere farther apart than ``jump_px``.
     """
+    start, middle, centre = places
     reach, total, count = weights.size // 2, 0.0, 0
-    for row in range(place.shape[0]):
+    for first in range(0, centre.size, run):
         broken = -1
-        for line in range(1, place.shape[1]):
-            if abs(middle[row, line] - middle[row, line - 1]) > jump_px:
+        for line in range(1, run):
+            m = first + line
+            if abs(start[m] - start[m - 1] + middle[m] - middle[m - 1]) > jump_px:
                 broken = line
             at = line - reach
             if at < reach or broken > at - reach:
                 continue
             residual = 0.0
             for k in range(weights.size):
-                residual += weights[k] * place[row, at - reach + k]
+                residual += weights[k] * (start[m - 2 * reach + k] + float(centre[m - 2 * reach + k]))
             total += min(abs(residual), _LARGEST_PX) ** 2
             count += 1
     return total, count

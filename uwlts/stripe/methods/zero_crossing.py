@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from uwlts.runtime.compiled import compiled
 from uwlts.stripe.peak_window import PeakWindow, gaussian_moments
 
 
@@ -23,10 +24,16 @@ def centres(peak: PeakWindow) -> np.ndarray:
 
     A background of slope b adds b sqrt(2 pi) s^2 to F everywhere, which is subtracted.
     """
-    kernel, moments = peak.kernel_sigma(), np.empty((peak.start.size, 3), np.float32)
-    gaussian_moments(peak, peak.middle, kernel, moments)
-    zeroth, first, second = moments.T
-    first = first - peak.slope * math.sqrt(2.0 * math.pi) * kernel * kernel
-    step = first / np.maximum(zeroth - second, 0.1 * np.abs(zeroth))
-    step = np.minimum(np.maximum(step, -0.5), 0.5)
-    return peak.middle + kernel * (step - 0.5 * step * step * step)
+    centre = np.empty(peak.start.size, np.float32)
+    _step_to_zeros(peak, centre)
+    return centre
+
+
+@compiled
+def _step_to_zeros(peak: PeakWindow, centre: np.ndarray) -> None:
+    half = np.float32(0.5)
+    for m in range(centre.size):
+        m0, m1, m2, sigma = gaussian_moments(peak, m, peak.middle[m])
+        m1 -= peak.slope[m] * np.float32(math.sqrt(2.0 * math.pi)) * sigma * sigma
+        step = min(max(m1 / max(m0 - m2, np.float32(0.1) * abs(m0)), -half), half)
+        centre[m] = peak.middle[m] + sigma * (step - half * step * step * step)
