@@ -385,9 +385,7 @@ def _render_scene(description: DataSetDescription, drawn: DrawnScene) -> list[Sa
         arrays = make_labels(simulator, shot, taken, description.labels)
         stripe = np.isin(arrays.get("status", LineStatus.VISIBLE), (LineStatus.VISIBLE, LineStatus.SATURATED)).mean()
         if shot.light == "laser" and stripe < description.least_stripe:
-            raise DesignError(
-                f"image {index} has the stripe on {100 * stripe:.2g} % of its lines, less than least_stripe"
-            )
+            raise DesignError(f"image {index} has the stripe on {stripe:.2%} of its lines, less than least_stripe")
         info = _make_frame_metadata(description, drawn, simulator, shot, taken, index)
         samples.append(Sample(f"{drawn.number:06d}-{index:02d}", taken.image, arrays, info))
     return samples

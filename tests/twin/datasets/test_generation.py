@@ -168,7 +168,7 @@ def test_scenes_with_too_little_of_the_stripe_are_drawn_anew(tmp_path, monkeypat
     assert min(seen[0]) == 0 and min(seen[1]) >= 0.2
     assert sets[0].card.redrawn == 0 < sets[1].card.redrawn < 6
     monkeypatch.setattr("twin.datasets.generation.MOST_ATTEMPTS", 2)
-    with pytest.raises(DesignError, match="image 0 has the stripe on .* % of its lines, less than least_stripe"):
+    with pytest.raises(DesignError, match="image 0 has the stripe on .*% of its lines, less than least_stripe"):
         twin.dataset(small(**one, least_stripe=1.0), out=tmp_path / "all", workers=1)
     with pytest.raises(ValueError, match="least_stripe 0.2 needs the label 'centre'"):
         small(labels=("masks",), least_stripe=0.2)
