@@ -392,6 +392,7 @@ RISING = tuple(range(21))
             "2 of 21 images is not between those of its neighbours, such as in image 9:",
         ),
         ((*RISING[:9], 40, *RISING[10:]), "1 of 21 images is not between those of its neighbours, such as in image 9:"),
+        (tuple(40 if n % 5 == 2 else n for n in RISING), "4 of 21 images is not between"),  # a fifth of another scan
         ((*RISING[:9], *range(30, 42)), None),  # the edge of a step
         ((*RISING[:12], *reversed(RISING[2:11])), None),  # a ridge
         ((0, 3, 1, 5, 2, 4, 1) * 3, None),  # a surface that is rough from image to image
