@@ -85,6 +85,8 @@ class Flaws:
     """Reflectance of the camera's window for a ring lamp around the lens, which appears out of focus."""
     dirt: float = _flaw(off=0.0, typical=0.1, least=0.0, most=0.9)
     """Fraction of the camera's window that is covered with spots, which darken blurred patches of the image."""
+    ghost: float = _flaw(off=0.0, typical=0.003, least=0.0, most=0.1)
+    """Fraction of an image's light that image sensor and lens reflect to a blurred image, mirrored at the axis."""
     lamp_and_laser: bool = False
     """Lamp and laser are on in every image, so that it shows stripe and board."""
     pixel_aspect: float = _flaw(off=1.0, typical=1.002, least=0.9, most=1.1)
@@ -93,6 +95,8 @@ class Flaws:
     """Increment of the tangential distortion p1 of the lens as built."""
     rolling_shutter: float = _flaw(off=0.0, typical=10.0, least=0.0, most=1000.0)
     """Delay in us between rows of a rolling shutter; visible while the stage moves."""
+    row_noise: float = _flaw(off=0.0, typical=5.0, least=0.0, most=1000.0)
+    """Standard deviation in electrons of an offset that all pixels of a row share, different in each image."""
     jpeg: int = _flaw(off=0, typical=90, least=1, most=100)
     """Quality of JPEG compression; 8-bit images only."""
     colour_filter: bool = False

@@ -178,8 +178,9 @@ class DataSetDescription(Description):
 
     Indices in lists start at 0. Values of integers are rounded.
 
-    ``spp``, ``effects`` and ``without`` are those of `twin.simulate`. ``labels`` are the arrays stored with each image.
-    Each file has ``scenes_per_shard`` scenes.
+    Scenes are drawn again if any laser image has the stripe on less than the fraction ``least_stripe`` of its profile
+    lines. ``spp``, ``effects`` and ``without`` are those of `twin.simulate`. ``labels`` are the arrays stored with each
+    image. Each file has ``scenes_per_shard`` scenes.
     """
 
     title: str
@@ -191,6 +192,7 @@ class DataSetDescription(Description):
     scene: Scene
     seed: Annotated[int, Field(ge=0)] = 0
     scenes: Annotated[int, Field(ge=1, le=1_000_000)] = 100
+    least_stripe: Annotated[float, Field(ge=0, le=1)] = 0.0
     scenes_per_shard: Annotated[int, Field(ge=1, le=100_000)] = 16
     splits: Splits = Splits()
     spp: Annotated[int, Field(ge=1, le=65536)] = 16
@@ -230,6 +232,8 @@ class DataSetDescription(Description):
         for path in self.vary:
             if path.partition(".")[2] in _ONE_FOR_ALL:
                 raise ValueError(f"vary '{path}': all frames of a data set have the same size; make two data sets")
+        if self.least_stripe > 0 and "centre" not in self.labels:
+            raise ValueError(f"least_stripe {self.least_stripe:g} needs the label 'centre': add it to labels")
         if "target" in self.labels:
             printed = [thing for thing in self.scene.objects if isinstance(thing, PrintedPlate)]
             if not printed:

@@ -355,30 +355,40 @@ def _render_shard(job: _Job, report: Callable[[None], None]) -> None:
     mi.set_log_level(mi.LogLevel.Error)
     with open_shard(job.path) as writer:
         for scene in job.scenes:
-            drawn, simulator = _draw_measurable(job.description, scene)
-            for index, shot in enumerate(drawn.scene.motion.shots()):
-                taken = simulator.expose(shot, index, exposure=drawn.exposures[index], bright_share=_BRIGHT)
-                arrays = make_labels(simulator, shot, taken, job.description.labels)
-                info = _make_frame_metadata(job.description, drawn, simulator, shot, taken, index)
-                writer.add(Sample(f"{scene:06d}-{index:02d}", taken.image, arrays, info))
+            for sample in _render_measurable(job.description, scene):
+                writer.add(sample)
                 report(None)
 
 
-def _draw_measurable(description: DataSetDescription, scene: int) -> tuple[DrawnScene, SensorSimulator]:
-    """Draw a scene until the sensor can measure it; return the scene and its simulator."""
-    from twin.recording.sensor_simulator import SensorSimulator
-
+def _render_measurable(description: DataSetDescription, scene: int) -> list[Sample]:
+    """Draw a scene until the sensor can measure it; return its frames."""
     why = None
     for attempt in range(MOST_ATTEMPTS):
         drawn = draw_scene(description, scene, attempt=attempt)
         try:
-            return drawn, SensorSimulator(drawn.as_built, drawn.scene, drawn.options, probe="middle")
+            return _render_scene(description, drawn)
         except DesignError as error:
             why = error
     raise DesignError(
         f"scene {scene} of '{description.title}' was drawn {MOST_ATTEMPTS} times, but the sensor can measure none of "
         f"the draws: narrow the distributions in vary. The last one: {why}"
     ) from why
+
+
+def _render_scene(description: DataSetDescription, drawn: DrawnScene) -> list[Sample]:
+    """Render the frames of a scene; DesignError if the sensor cannot measure it, or sees too little of the stripe."""
+    from twin.recording.sensor_simulator import SensorSimulator
+
+    simulator, samples = SensorSimulator(drawn.as_built, drawn.scene, drawn.options, probe="middle"), []
+    for index, shot in enumerate(drawn.scene.motion.shots()):
+        taken = simulator.expose(shot, index, exposure=drawn.exposures[index], bright_share=_BRIGHT)
+        arrays = make_labels(simulator, shot, taken, description.labels)
+        stripe = np.isin(arrays.get("status", LineStatus.VISIBLE), (LineStatus.VISIBLE, LineStatus.SATURATED)).mean()
+        if shot.light == "laser" and stripe < description.least_stripe:
+            raise DesignError(f"image {index} has the stripe on {stripe:.2%} of its lines, less than least_stripe")
+        info = _make_frame_metadata(description, drawn, simulator, shot, taken, index)
+        samples.append(Sample(f"{drawn.number:06d}-{index:02d}", taken.image, arrays, info))
+    return samples
 
 
 def _make_frame_metadata(

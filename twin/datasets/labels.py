@@ -56,7 +56,7 @@ def make_labels(
     from twin.recording.frame_truth import find_visible_surfaces
 
     arrays: dict[str, np.ndarray] = {}
-    noise = noise_std_e(taken, simulator.sensor.detector)
+    noise = noise_std_e(taken, simulator.sensor.detector, row_noise_e=simulator.options.flaws.row_noise)
     if {"centre", "quality", "points"} & set(wanted):
         lines = _line_labels(simulator, shot, taken, noise)
         names: dict[str, tuple[str, ...]] = {"centre": ("centre_px", "centroid_px", "status")}
@@ -118,14 +118,14 @@ def _target_points(simulator: SensorSimulator, shot: Shot) -> np.ndarray:
     return project_points(simulator.renderer, simulator.pose(shot), points).astype(np.float32)
 
 
-def noise_std_e(taken: SimulatedImage, detector: Detector) -> np.ndarray:
+def noise_std_e(taken: SimulatedImage, detector: Detector, *, row_noise_e: float = 0.0) -> np.ndarray:
     """Return the standard deviation (H, W) in electrons of the temporal noise of pixels (EMVA 1288 release 4, Eq. 13).
 
-    It includes shot noise of light and dark current, read noise, and quantisation with a variance of 1/12 of a grey
-    value squared. It does not include speckle and differences between pixels.
+    It includes shot noise of light and dark current, read noise, that of rows, and quantisation with a variance of 1/12
+    of a grey value squared. It does not include speckle and differences between pixels.
     """
     dark = 1e-3 * taken.exposure_ms * detector.dark_current_e_per_s * detector.dark_current_growth()
-    constant = dark + detector.read_noise_e**2 + 1 / (12 * detector.gain_dn_per_e() ** 2)
+    constant = dark + detector.read_noise_e**2 + row_noise_e**2 + 1 / (12 * detector.gain_dn_per_e() ** 2)
     return np.sqrt(taken.total() + np.float32(constant))
 
 

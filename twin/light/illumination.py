@@ -29,6 +29,7 @@ from twin.scene.objects import MirrorFace, Objects
 from twin.scene.platform_kinds import GRAVITY_M_S2
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Sensor
+from uwlts.runtime.compiled import compiled
 
 _LARGEST_SLOPE = 0.7
 """Largest ratio of the distance from the sheet to the distance from the window that `SheetLobe` handles."""
@@ -479,14 +480,23 @@ def focus_light(along: np.ndarray, across: np.ndarray, *, depth_mm: float, index
     aside = depth_mm * count / PATCH_MM * np.tan(incidence - np.arcsin(np.sin(incidence) / index))
     aside /= np.maximum(steepness, 1e-12)
     x, y = np.arange(count) - aside * along, np.arange(count)[:, None] - aside * across
-    column, row = np.floor(x).astype(int), np.floor(y).astype(int)
-    right, down = x - column, y - row
-    light = np.zeros(count * count)
-    for beside, below in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        place = (row + below) % count * count + (column + beside) % count
-        share = (right if beside else 1 - right) * (down if below else 1 - down)
-        light += np.bincount(place.ravel(), share.ravel(), light.size)
-    return light.reshape(count, count)
+    light = np.zeros((count, count))
+    _divide_among_nodes(x, y, light)
+    return light
+
+
+@compiled
+def _divide_among_nodes(x: np.ndarray, y: np.ndarray, light: np.ndarray) -> None:
+    """Add a ray's light at each place (N, N), in cells, to the four nearest nodes of the periodic ``light`` (N, N)."""
+    count = len(light)
+    for i in range(count):
+        for j in range(count):
+            column, row = math.floor(x[i, j]), math.floor(y[i, j])
+            right, down = x[i, j] - column, y[i, j] - row
+            for beside in range(2):
+                for below in range(2):
+                    share = (right if beside else 1 - right) * (down if below else 1 - down)
+                    light[(row + below) % count, (column + beside) % count] += share
 
 
 @dataclass(frozen=True, eq=False)

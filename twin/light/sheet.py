@@ -41,6 +41,7 @@ _LARGEST_DEGREE = 27  # degree of the series before truncation, sufficient for f
 _LARGEST_MISS_MM = 1e-3  # largest distance between the series and a traced ray 1 m behind the window
 _SERIES_MM = 5e-5  # largest sum of the truncated terms of a series in mm, about the rounding errors of the traced rays
 _SERIES_SLOPE = 1e-7  # largest sum of the truncated terms of a series of slopes
+_FAINT_PEAK = 0.01  # peak irradiance of a faint side lobe divided by that of the main part
 _SMALLEST_SPREAD_MM = 1e-3  # smallest distance from the fan's vertex; rays closer to it are treated as at this distance
 
 
@@ -71,7 +72,8 @@ class Sheet:
 
     ``power_w`` is the power behind the window, before absorption. ``begins_at_z_mm`` is the smallest Z of the window's
     outer face in the OCS, before which there is no light. ``parts`` are the Gaussians across the sheet, the main one
-    first. Side lobes make the lit surface ``reach`` times as wide. The sheet of another laser has its own OCS;
+    first. Side lobes make the lit surface ``reach`` times as wide, those that are not faint ``bright_reach`` times. The
+    sheet of another laser has its own OCS;
     ``sheet_from_object`` (4, 4) transforms from the sensor's OCS to it. DesignError if part of the fan does not pass
     the window, or the window bends the fan too unevenly.
     """
@@ -111,8 +113,9 @@ class Sheet:
         lobes = [(share, 2 * offset, radius) for offset, radius, share in laser.side_lobes]
         main = (1 - math.fsum(share for share, _, _ in lobes), 0.0, 1.0)
         self.parts: list[Part] = [(opaque(share), opaque(at), opaque(radius)) for share, at, radius in (main, *lobes)]
-        reaches = [(abs(offset) + LIT_SIGMAS * radius) / LIT_SIGMAS for _, offset, radius in lobes]
-        self.reach = max([1.0, *reaches])
+        reaches = [(abs(offset) / LIT_SIGMAS + radius, share / radius) for share, offset, radius in lobes]
+        self.reach = max([1.0, *(reach for reach, _ in reaches)])
+        self.bright_reach = max([1.0, *(reach for reach, peak in reaches if peak > _FAINT_PEAK * main[0])])
         self._extinction = opaque(medium.extinction_per_mm(laser.wavelength_nm))
 
     def evaluate(self, p: Point3f) -> SheetLight:

@@ -169,11 +169,11 @@ def simulate(
         Optical properties of the water, instead of the medium's: pure, clear, coastal, harbour, jerlov-I to
         jerlov-9C, or a turbidity: 0 (pure), 1 (clear), 2 (coastal), 3 (harbour), or between.
     effects
-        Effects of real images to add, NAME of typical strength or NAME=STRENGTH: glare=0.02, vignetting=0.4,
-        uneven-lamp=0.6, particles=1000 and bubbles=200 (per litre), caustics=2 (wind in m/s), stray-light=0.02,
-        side-lobes=0.01, lamp-reflection=0.001, dirt=0.1, lamp-and-laser, pixel-aspect=1.002, tangential=0.001,
-        rolling-shutter=10 (us per row), jpeg=90, colour-filter, camera-3d=16 (steps per px; laser images become
-        centre lines).
+        Effects of real images to add, NAME of typical strength or NAME=STRENGTH: glare=0.02, ghost=0.003,
+        vignetting=0.4, uneven-lamp=0.6, particles=1000 and bubbles=200 (per litre), caustics=2 (wind in m/s),
+        stray-light=0.02, side-lobes=0.01, lamp-reflection=0.001, dirt=0.1, lamp-and-laser, pixel-aspect=1.002,
+        tangential=0.001, rolling-shutter=10 (us per row), row-noise=5 (electrons), jpeg=90, colour-filter,
+        camera-3d=16 (steps per px; laser images become centre lines).
     without
         Effects to leave out: defocus, haze, multiple-scattering, secondary-light, gloss, motion, ambient, speckle,
         fixed-pattern, noise.

@@ -24,6 +24,7 @@ from twin.scene.platforms import Light, Platform, Shot
 from twin.sensor.detector import (
     INVALID,
     PeakFinder,
+    add_ghost,
     add_glare,
     as_built,
     deliver_image,
@@ -250,9 +251,10 @@ class SensorSimulator:
         return shot.light == light or (self.options.flaws.lamp_and_laser and shot.light != "day")
 
     def _apply_lens(self, irradiance: np.ndarray) -> np.ndarray:
-        """Return the irradiance (H, W) behind the lens, with vignetting and glare."""
-        passed, glare = irradiance if self._passed is None else irradiance * self._passed, self.options.flaws.glare
-        return add_glare(passed, glare) if glare else passed
+        """Return the irradiance (H, W) behind the lens, with vignetting, ghost and glare."""
+        passed, flaws = irradiance if self._passed is None else irradiance * self._passed, self.options.flaws
+        passed = add_ghost(passed, self.sensor.camera, flaws.ghost) if flaws.ghost else passed
+        return add_glare(passed, flaws.glare) if flaws.glare else passed
 
     def _add_speckle(self, frame: LaserFrame, shot: Shot) -> np.ndarray:
         """Return the irradiance (H, W) of the laser in W/mm2, with speckle."""
@@ -359,7 +361,14 @@ class SensorSimulator:
     def detect(self, electrons: np.ndarray, *, exposure_ms: float, noise_seed: list[int]) -> np.ndarray:
         """Return grey values (H, W) for mean photo-electrons (H, W), with seeded noise if noise is enabled."""
         rng = np.random.default_rng(noise_seed) if self.options.effects.noise else None
-        image = grey_values(electrons, self.sensor.detector, exposure_ms=exposure_ms, rng=rng, pattern=self._pattern)
+        image = grey_values(
+            electrons,
+            self.sensor.detector,
+            exposure_ms=exposure_ms,
+            rng=rng,
+            pattern=self._pattern,
+            row_noise_e=self.options.flaws.row_noise,
+        )
         return deliver_image(image, self.options.flaws)
 
     def truth(self, shot: Shot) -> FrameTruth:

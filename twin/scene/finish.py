@@ -302,7 +302,7 @@ def register_textures() -> None:
             return value
 
     class RandomReflectance(ExactTexture):
-        """Log-normal reflectance, limited to 1, with patches of another one, both times a scale.
+        """Log-normal reflectance, limited to 1, with patches of another mean, times a scale.
 
         Both follow from Gaussian fields of plane waves in the scene.
         """
@@ -316,20 +316,17 @@ def register_textures() -> None:
             mean, share, scale = table["mean"], table["share"], table["scale"]
             deviation = log_deviation(table["mottle"])
             self.gain, self.most = opaque(deviation * math.sqrt(2 / WAVES)), opaque(scale)
-            self.middle = opaque(mean * math.exp(-(deviation**2) / 2))
+            self.middle, self.patch = (opaque(each * math.exp(-(deviation**2) / 2)) for each in (mean, table["patch"]))
             self.level = opaque(table.get("level", 0.0) * math.sqrt(WAVES / 2))
-            self.patch = opaque(scale * table["patch"])
             self.average = opaque(scale * (mean + share * (table["patch"] - mean)))
 
         def eval_1(self, si: SurfaceInteraction3f, active: Bool = True) -> Float:
             value = mi.Float(self.middle)
+            if self.patch_waves is not None:
+                value = dr.select(_sum_waves(self.patch_waves, si.p, active) > self.level, self.patch, value)
             if self.mottle_waves is not None:
                 value *= dr.exp(self.gain * _sum_waves(self.mottle_waves, si.p, active))
-            value = self.most * dr.minimum(value, 1.0)
-            if self.patch_waves is not None:
-                covered = _sum_waves(self.patch_waves, si.p, active) > self.level
-                value = dr.select(covered, self.patch, value)
-            return value
+            return self.most * dr.minimum(value, 1.0)
 
     mi.register_texture("target_pattern", TargetPattern)
     mi.register_texture("random_reflectance", RandomReflectance)

@@ -49,13 +49,15 @@ def grey_values(
     exposure_ms: float,
     rng: np.random.Generator | None,
     pattern: FixedPattern | None = None,
+    row_noise_e: float = 0.0,
 ) -> np.ndarray:
     """Return the image (H, W), uint8 or uint16, for mean photo-electrons (H, W) and their exposure time.
 
     Signal and dark current have Poisson shot noise. Blooming and full well are applied before the read-out, which adds
-    offset pattern and noise; the only quantisation is the final rounding. Bands of rows have independent random
-    numbers, so that the image does not depend on the number of parallel tasks. Without ``rng`` there is no temporal
-    noise, without ``pattern`` no fixed one. ImageError if the electrons are not finite numbers from 0 to 1e15.
+    offset pattern and noise. The noise with the standard deviation ``row_noise_e`` is common to the pixels of a row.
+    The only quantisation is the final rounding. Bands of rows have independent random numbers, so that the image does
+    not depend on the number of parallel tasks. Without ``rng`` there is no temporal noise, without ``pattern`` no fixed
+    one. ImageError if the electrons are not finite numbers from 0 to 1e15.
     """
     electrons = np.asarray(electrons, np.float32)
     least, most = electrons.min(), electrons.max()
@@ -79,7 +81,7 @@ def grey_values(
                 np.concatenate(charges), full_well_e=detector.full_well_e, share=detector.blooming
             )
             charges = np.array_split(bloomed, count)
-        return np.concatenate(list(run(_digitise, charges, detectors, patterns, rngs)))
+        return np.concatenate(list(run(_digitise, charges, detectors, patterns, rngs, [row_noise_e] * count)))
 
 
 def _collect(
@@ -112,7 +114,11 @@ def _mean_electrons(
 
 
 def _digitise(
-    charge: np.ndarray, detector: Detector, pattern: FixedPattern | None, rng: np.random.Generator | None
+    charge: np.ndarray,
+    detector: Detector,
+    pattern: FixedPattern | None,
+    rng: np.random.Generator | None,
+    row_noise_e: float,
 ) -> np.ndarray:
     """Return the grey values of collected electrons, which are overwritten."""
     signal = np.minimum(charge, np.float32(detector.full_well_e), out=charge)
@@ -120,6 +126,8 @@ def _digitise(
         signal += pattern.offset_e
     if rng is not None:
         add_normal_numbers(signal, detector.read_noise_e, rng)
+        if row_noise_e:
+            signal += np.float32(row_noise_e) * rng.standard_normal((len(signal), 1), np.float32)
     image = np.empty(signal.shape, np.uint8 if detector.bits == 8 else np.uint16)
     scale, offset = np.float32(detector.gain_dn_per_e()), np.float32(detector.black_level_dn)
     _round(signal.ravel(), scale, offset, np.float32(detector.full_scale_dn()), image.ravel())
@@ -257,6 +265,7 @@ class PeakFinder:
 
 GLARE_REACH = 0.15
 """Decay length of glare (1 / e) as a fraction of the image width (assumed from its visual appearance)."""
+GHOST_BLUR = 0.01  # standard deviation of a ghost's blur as a fraction of the image width (assumed)
 _SPOT_MM = 0.2, 3.0
 """Range of the diameters of spots on the window, from silt and fouling films to drops and fingerprints."""
 _CELLS_PER_SPOT = 4  # so that a round spot stays round
@@ -370,6 +379,18 @@ def add_glare(light: np.ndarray, share: float) -> np.ndarray:
     veil = np.maximum(fftconvolve(coarse, kernel, mode="same"), 0).astype(np.float32)
     veil = cv2.resize(veil, padded.shape[::-1], interpolation=cv2.INTER_LINEAR)[:height, :width]
     return np.float32(1 - share) * light + np.float32(share) * veil
+
+
+def add_ghost(light: np.ndarray, camera: Camera, share: float) -> np.ndarray:
+    """Mirror the fraction ``share`` of light (H, W) at the principal point, blurred by a Gaussian of `GHOST_BLUR`.
+
+    Light that the image sensor and then a surface of the lens reflect forms such an image, upside down and blurred.
+    """
+    cx, cy = camera.principal_point()
+    turned = np.array([[-1, 0, 2 * cx], [0, -1, 2 * cy]])
+    ghost = cv2.warpAffine(light, turned, light.shape[::-1])
+    blurred = cv2.GaussianBlur(ghost, (0, 0), GHOST_BLUR * camera.width_px)
+    return np.float32(1 - share) * light + np.float32(share) * blurred
 
 
 def laser_shares(height: int, width: int) -> np.ndarray:

@@ -1,7 +1,6 @@
 """Numbers, times and encoder counts of images: gaps, duplicates, mixtures of naming, and counters that start again."""
 
 import re
-from collections import Counter
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import PurePosixPath
@@ -33,41 +32,44 @@ class Counted(NamedTuple):
         return (self.numbers - (self.numbers[0] if first is None else first)) // self.step
 
 
-def count_names(names: Sequence[str]) -> Counted | None:
+def count_names(names: Sequence[str], *, series: bool = False) -> Counted | None:
     """Return the increasing numbers of images in their names.
 
     The names differ in one number, or in several; then the one with the fewest gaps counts. None if no number counts,
-    as in names without digits and in times.
+    as in names without digits and in times. ``series``: numbers may start again, as for poses in a list of their own.
 
-    Raises DescriptionError for a mixture of naming, a number that occurs twice, or an order against the numbers.
+    Raises DescriptionError for a mixture of naming, a number that occurs twice, and numbers that decrease or restart.
     """
     parts = [re.split(r"([0-9]+)", name.casefold()) for name in names]
-    forms = Counter(tuple(part[::2]) for part in parts)
+    forms = {tuple(part[::2]): name for name, part in zip(reversed(names), reversed(parts), strict=True)}
     if len(names) < 2 or all(len(form) == 1 for form in forms):
         return None
     if len(forms) > 1:
-        usual = forms.most_common(1)[0][0]
-        one, other = (
-            next(n for n, part in zip(names, parts, strict=True) if (tuple(part[::2]) == usual) is same_length)
-            for same_length in (True, False)
-        )
+        other, one, *_ = forms.values()
         raise DescriptionError(
             f"{one} and {other} are named in different ways, so that their order is unknown: narrow the patterns, or "
             "give a table with a column stage_mm"
         )
     columns = [[int(number) for number in column] for column in zip(*(part[1::2] for part in parts), strict=True)]
     varying = [column for column in columns if len(set(column)) > 1]
-    if len(varying) < 2:
-        for place, (one, two) in enumerate(pairwise(varying[0] if varying else columns[0])):
-            if one >= two:
-                problem = (
-                    "have the same number: remove one" if one == two else "are in the reverse order of their numbers"
-                )
-                raise DescriptionError(
-                    f"{names[place]} and {names[place + 1]} {problem}, or give a table with a column stage_mm"
-                )
     counts = [_count(np.array(column)) for column in varying if max(column) < 10**_LONGEST]
-    return min((each for each in counts if each is not None), key=lambda each: each.places()[-1], default=None)
+    if known := [each for each in counts if each is not None]:
+        return min(known, key=lambda each: each.places()[-1])
+    alone = len(varying) < 2
+    for column in varying or columns[:1]:
+        falls = [place for place, (one, two) in enumerate(pairwise(column)) if one > two or (alone and one == two)]
+        place = falls[0] if falls else 0
+        # Counts of several scans return to 0 or 1; so do seconds and minutes of times, but after 59.
+        again = not alone and not series and column[0] < 2 and all(column[each + 1] == column[0] for each in falls)
+        in_time = column[place] < 60 <= 2 * column[place] - column[place - 1] + 1
+        if falls and (alone or (again and not in_time)):
+            same = column[place] == column[place + 1]
+            problem = "have the same number: remove one" if same else "are in the reverse order of their numbers"
+            problem = "are the last and first of two scans: narrow the patterns" if again else problem
+            raise DescriptionError(
+                f"{names[place]} and {names[place + 1]} {problem}, or give a table with a column stage_mm"
+            )
+    return None
 
 
 def _count(numbers: np.ndarray) -> Counted | None:

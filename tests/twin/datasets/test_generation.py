@@ -154,6 +154,26 @@ def test_scenes_that_the_sensor_cannot_see_are_drawn_anew(tmp_path, monkeypatch)
         twin.dataset(small(vary=least), out=tmp_path / "farther", workers=1)
 
 
+def test_scenes_with_too_little_of_the_stripe_are_drawn_anew(tmp_path, monkeypatch):
+    one = {"scenes": 6, "labels": ("centre",), "splits": {"train": 1, "validation": 0, "test": 0}}
+    weak = {"sensor.laser.power_mw": {"kind": "choice", "values": (1e-4, 7.0)}}
+    sets = [
+        twin.load_dataset(
+            twin.dataset(small(**one, vary=weak, least_stripe=least), out=tmp_path / f"{least}", workers=1)
+        )
+        for least in (0.0, 0.2)
+    ]
+    shown = LineStatus.VISIBLE, LineStatus.SATURATED
+    seen = [[np.isin(sample["status"], shown).mean() for sample in each] for each in sets]
+    assert min(seen[0]) == 0 and min(seen[1]) >= 0.2
+    assert sets[0].card.redrawn == 0 < sets[1].card.redrawn < 6
+    monkeypatch.setattr("twin.datasets.generation.MOST_ATTEMPTS", 2)
+    with pytest.raises(DesignError, match="image 0 has the stripe on .*% of its lines, less than least_stripe"):
+        twin.dataset(small(**one, least_stripe=1.0), out=tmp_path / "all", workers=1)
+    with pytest.raises(ValueError, match="least_stripe 0.2 needs the label 'centre'"):
+        small(labels=("masks",), least_stripe=0.2)
+
+
 def test_splits_hold_different_scenes_and_together_all(folder):
     scenes = {
         split: {each["info"]["scene"] for each in twin.load_dataset(folder, split=split)} for split in get_args(Split)

@@ -82,6 +82,55 @@ def test_lattice_is_even_along_either_side(count):
         assert np.hypot(across, along).min() > 0.33 / math.sqrt(count)
 
 
+def test_faint_side_lobes_take_fewer_samples(thesis, monkeypatch):
+    changes = {"laser": {"waist_radius_mm": 0.4, "side_lobes": ((0.0, 30.0, 0.1),)}}
+    scene = scene_of(plate(), block((40.0, 6.0, 12.0), (0.0, 0.0, -6.0), reflectance=0.5))
+    sensor, images, rendered = altered(cropped(thesis, 160, 160), changes), [], []
+    whole = PixelSampler.render
+
+    def counted(self: PixelSampler, *arguments: Any, spp: int, **kwargs: Any) -> np.ndarray:
+        rendered[-1] += len(arguments[2]) * spp
+        return whole(self, *arguments, spp=spp, **kwargs)
+
+    monkeypatch.setattr(PixelSampler, "render", counted)
+    monkeypatch.setattr("twin.light.renderer._WIDE_PX", math.inf)
+    for faint in (0.01, 0.0):
+        monkeypatch.setattr("twin.light.sheet._FAINT_PEAK", faint)
+        renderer = Renderer(sensor, clear(0.3), scene, effects=replace(NONE, defocus=True))
+        rendered.append(0)
+        images.append(renderer.laser_frame(sensor_at(), spp=16).irradiance().astype(float))
+    assert 0.2 * rendered[1] < rendered[0] < 0.7 * rendered[1]
+    change = np.abs(images[0] - images[1]) / images[1].max()
+    # The main stripe is the same. Means over a pixel of the pedestal are off by a part of its second difference, which
+    # is 1e-3 at most, as in wide stripes.
+    assert (change[images[1] > 0.1 * images[1].max()] == 0).all()
+    assert np.quantile(change, 0.999) < 1e-3
+    assert images[0].sum() == pytest.approx(images[1].sum(), rel=3e-4)
+
+
+def test_slight_texture_takes_fewer_samples_in_lamp_images(thesis, monkeypatch):
+    spotted = plate(reflectance=0.5) | {"mottle": 0.15, "mottle_mm": 3.0}
+    scene = scene_of(spotted, block((40.0, 6.0, 12.0), (0.0, 0.0, -6.0), reflectance=0.1))
+    sensor, images, rendered = cropped(thesis, 160, 160), [], []
+    whole = PixelSampler.render
+
+    def counted(self: PixelSampler, *arguments: Any, spp: int, **kwargs: Any) -> np.ndarray:
+        rendered[-1] += len(arguments[2]) * spp
+        return whole(self, *arguments, spp=spp, **kwargs)
+
+    monkeypatch.setattr(PixelSampler, "render", counted)
+    for share in (0.05, 0.0):
+        monkeypatch.setattr("twin.light.renderer.EDGE_SHARE", share)
+        rendered.append(0)
+        images.append(Renderer(sensor, clear(0.3), scene, effects=NONE).irradiance("lamp", sensor_at(), spp=16))
+    assert 0.1 * rendered[1] < rendered[0] < 0.5 * rendered[1]
+    change = np.abs(images[0] - images[1]) / images[1].max()
+    assert (change == 0).sum() > 100, "edges are rendered as finely as before"
+    # Corners that differ by 5 % of the maximum at most; four samples average their difference to a fifth or less.
+    assert change.max() < 0.01
+    assert images[0].sum() == pytest.approx(images[1].sum(), rel=3e-4)
+
+
 def test_wide_stripes_take_fewer_samples_where_they_are_smooth(thesis, monkeypatch):
     # 23 px of standard deviation, broken by the edges and the shadow of a block.
     sensor = altered(cropped(thesis, 160, 160), {"laser": {"waist_radius_mm": 8.0}})

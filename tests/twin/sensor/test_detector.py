@@ -110,6 +110,16 @@ def test_dark_current_adds_electrons_and_their_noise():
     np.testing.assert_allclose(noise / gain**2, 5.0 * exposures + 100.0, rtol=0.025)
 
 
+def test_rows_share_an_offset_that_is_new_in_each_image():
+    chip, noise_e = detector(read_noise_e=4.0), 20.0
+    rng, dark = np.random.default_rng(5), np.zeros((2000, 100), np.float32)
+    images = [grey_values(dark, chip, exposure_ms=0.0, rng=rng, row_noise_e=noise_e) for _ in range(2)]
+    first, second = (image.mean(axis=1) / chip.gain_dn_per_e() for image in images)
+    # Means over 100 pixels also have a tenth of the read noise; 2000 rows give the deviation to 1.6 %: four of these.
+    assert first.std() == pytest.approx(np.hypot(noise_e, 0.4), rel=0.065)
+    assert abs(np.corrcoef(first, second)[0, 1]) < 4 / np.sqrt(2000)
+
+
 @pytest.mark.parametrize(("bits", "kind"), [(8, np.uint8), (10, np.uint16), (12, np.uint16)])
 def test_without_noise_grey_values_are_rounded_electrons(bits, kind):
     chip = detector(bits=bits, black_level_dn=3.0, dark_current_e_per_s=1000.0)

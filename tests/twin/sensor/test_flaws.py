@@ -9,7 +9,16 @@ from PIL import Image
 
 from tests.virtual_sensors import altered
 from twin.rendering_options import Flaws
-from twin.sensor.detector import GLARE_REACH, add_glare, as_built, deliver_image, laser_shares, vignette
+from twin.sensor.detector import (
+    GHOST_BLUR,
+    GLARE_REACH,
+    add_ghost,
+    add_glare,
+    as_built,
+    deliver_image,
+    laser_shares,
+    vignette,
+)
 from uwlts.errors import DescriptionError
 
 
@@ -45,6 +54,22 @@ def test_glare_keeps_light_that_does_not_leave_the_image():
     # The kernel is summed in cells of a sixteenth of its reach: some 1e-3 of the share.
     assert seen.sum() == pytest.approx(1 - 0.2 * (1 - within), abs=1e-3)
     assert seen[320, 160] == pytest.approx(0.8, abs=1e-3)
+
+
+def test_a_ghost_is_mirrored_at_the_principal_point(thesis):
+    camera = altered(thesis, {"camera": {"principal_point_px": (600.0, 500.0)}}).camera
+    light = np.zeros((1024, 1280), np.float32)
+    light[400, 900] = 1.0
+    seen = add_ghost(light, camera, 0.01).astype(float)
+    assert seen.sum() == pytest.approx(1.0, abs=1e-4)
+    assert seen[400, 900] == pytest.approx(0.99)
+    seen[400, 900] = 0.0
+    rows, columns = np.indices(seen.shape)
+    row, column = ((seen * each).sum() / seen.sum() for each in (rows, columns))
+    assert (row, column) == pytest.approx((600.0, 300.0), abs=0.05)
+    # OpenCV cuts the Gaussian off at four standard deviations.
+    spread = np.sqrt((seen * (rows - row) ** 2).sum() / seen.sum())
+    assert spread == pytest.approx(GHOST_BLUR * 1280, rel=0.02)
 
 
 def test_vignetting_is_the_stated_loss_at_the_farthest_corner(thesis):

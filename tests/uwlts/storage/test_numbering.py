@@ -1,10 +1,33 @@
-"""Encoder counts continue where the counter passes the end of its range."""
+"""Numbers in names count one scan; encoder counts continue where the counter passes the end of its range."""
+
+from datetime import datetime, timedelta
 
 import numpy as np
 import pytest
 
 from uwlts.errors import DescriptionError
-from uwlts.storage.numbering import unwrap_counts
+from uwlts.storage.numbering import count_names, unwrap_counts
+
+
+@pytest.mark.parametrize("form", ["scan{}_{:03d}.png", "{}/laser_{}.png", "2024-05-0{}_{:04d}.tif"])
+@pytest.mark.parametrize("first", [0, 1])
+def test_numbers_that_start_again_are_refused(form: str, first: int):
+    names = [form.format(scan, number) for scan in (1, 2, 3) for number in range(first, first + 40 + scan)]
+    with pytest.raises(DescriptionError, match="are the last and first of two scans: narrow the patterns"):
+        count_names(names)
+    assert count_names(names, series=True) is None
+    # Numbers that continue are those of one scan.
+    continued = count_names([form.format(1 + (number > 20), number) for number in range(first, 40)])
+    assert continued is not None and continued.places()[-1] == 39 - first
+
+
+@pytest.mark.parametrize("form", ["%Y-%m-%d_%H-%M-%S", "%H%M%S-%f", "%H-%M-%S_%f"])
+@pytest.mark.parametrize("step_s", [0.04, 1.0, 1.5, 2.0, 7.3, 10.0])
+def test_times_in_names_are_no_counts_that_start_again(form: str, step_s: float):
+    """The clock passes minutes and an hour; the first second is 0, where counts begin too."""
+    begin = datetime(2024, 5, 1, 10, 58, 0, 123456)
+    times = [(begin + timedelta(seconds=step_s * number)).strftime(form) for number in range(400)]
+    count_names(list(dict.fromkeys(times)))
 
 
 def wrapped(counts: np.ndarray, bits: int, *, signed: bool) -> np.ndarray:

@@ -3,7 +3,6 @@
 from collections.abc import Iterable
 
 import numpy as np
-import trimesh
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
@@ -143,8 +142,7 @@ def rounded_box(size_mm: np.ndarray, *, radius_mm: float) -> tuple[np.ndarray, n
     caps = [(bottom[0], bottom[3], bottom[2]), (bottom[0], bottom[2], bottom[1]), top[[0, 1, 2]], top[[0, 2, 3]]]
     faces = np.concatenate([faces, np.array(caps)])
     # Triangles at the poles have no area.
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    return vertices, faces[np.linalg.norm(np.cross(b - a, c - a), axis=1) > 0]
+    return vertices, faces[np.linalg.norm(_normals(vertices, faces), axis=1) > 0]
 
 
 def add_relief(
@@ -159,21 +157,31 @@ def add_relief(
     """
     vertices, faces, *uv = surface
     lengths = np.ones(3) * own.relief_length_mm
-    area = trimesh.Trimesh(vertices, faces, process=False).area
+    area = 0.5 * float(np.linalg.norm(_normals(vertices, faces), axis=1).sum())
     step = max(float(lengths.min()) / 20, 2 * float(np.sqrt(area / _RELIEF_VERTICES)))
     values, faces = _split_edges(np.hstack([vertices, *uv]), faces, step)
-    fine, cell = trimesh.Trimesh(values[:, :3], faces, process=False), step / float(lengths.min())
+    fine, cell = np.ascontiguousarray(values[:, :3]), step / float(lengths.min())
     # Fine and coarse waves; each field is periodic, but turned at random it does not repeat along a surface.
     height, variance, number = np.zeros(len(values)), 0.0, np.fft.fftfreq(_RELIEF_CELLS)
     for size, least in ((cell, 0.125 / cell), (4 * cell, 0.0)):
         k = np.sqrt(number[:, None, None] ** 2 + number[:, None] ** 2 + number[: _RELIEF_CELLS // 2 + 1] ** 2) / size
         density = (1 + (2 * np.pi * k) ** 2) ** -(own.relief_exponent + 1.5) * (k > least) * (k <= 0.5 / size)
         field = np.fft.irfftn(np.fft.rfftn(rng.standard_normal((_RELIEF_CELLS,) * 3)) * np.sqrt(density / size**3))
-        places = fine.vertices / lengths @ Rotation.from_quat(rng.standard_normal(4)).as_matrix() / size
+        places = fine / lengths @ Rotation.from_quat(rng.standard_normal(4)).as_matrix() / size
         height += map_coordinates(field, places.T, order=3, mode="grid-wrap")
         variance += field.var()
     height *= own.relief_mm / np.sqrt(variance)
-    return fine.vertices + fine.vertex_normals * height[:, None], faces, *([values[:, 3:]] if uv else [])
+    # The normal of a vertex is the mean of its facets', weighted by their areas.
+    corners = np.repeat(_normals(fine, faces), 3, axis=0).T
+    outward = np.stack([np.bincount(faces.ravel(), each, len(fine)) for each in corners], axis=1)
+    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), np.finfo(float).tiny)
+    return fine + outward * height[:, None], faces, *([values[:, 3:]] if uv else [])
+
+
+def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return the normals (F, 3) of triangles, twice as long as their areas in mm2."""
+    a, b, c = (vertices[corner] for corner in faces.T)
+    return np.cross(b - a, c - a)
 
 
 def _split_edges(values: np.ndarray, faces: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
@@ -184,13 +192,15 @@ def _split_edges(values: np.ndarray, faces: np.ndarray, longest: float) -> tuple
     """
     done, strips = [], np.zeros((0, 4), int)  # corners a, b, c, d: b to c and d to a are short
     while len(faces) or len(strips):
-        ends = [np.sort(np.stack([cells, np.roll(cells, -1, axis=1)], -1).reshape(-1, 2)) for cells in (faces, strips)]
-        edges, number = np.unique(np.concatenate(ends) @ [len(values), 1], return_inverse=True)
-        first, second = np.divmod(edges, len(values))
-        long = np.linalg.norm(values[first, :3] - values[second, :3], axis=1) > longest
-        middle = np.where(long, len(values) + np.cumsum(long) - 1, -1)[number]
-        values = np.vstack([values, (values[first] + values[second])[long] / 2])
+        ends = [np.stack([cells, np.roll(cells, -1, axis=1)], -1).reshape(-1, 2) for cells in (faces, strips)]
+        first, second = (order(*np.concatenate(ends).T) for order in (np.minimum, np.maximum))
+        long = sum(np.square(axis[first] - axis[second]) for axis in values.T[:3].copy()) > longest**2
+        edges, number = np.unique(first[long] * len(values) + second[long], return_inverse=True)
+        middle = np.full(len(long), -1)
+        middle[long] = len(values) + number
         of_faces, of_strips = middle[: faces.size].reshape(-1, 3), middle[faces.size :].reshape(-1, 4)
+        first, second = np.divmod(edges, len(values))
+        values = np.vstack([values, (values[first] + values[second]) / 2])
         count = np.sum(of_faces >= 0, axis=1)
         done.append(faces[count == 0])
         # The only long edge comes first, the only short one last.
