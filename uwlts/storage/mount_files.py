@@ -206,7 +206,7 @@ def read_profiles(
         if not (files := _list_files(path)):
             raise DescriptionError(f"{path} holds no CSV files: expected one for each pose")
         listed = [file.name for file in files]
-        log_warnings(path, name_gaps(listed, count_names(listed)))
+        log_warnings(path, name_gaps(listed, count_names(listed, series=True)))
         names, profiles, times = [], [], []
         for file in files:
             table = read_number_table(file)

@@ -32,11 +32,11 @@ class Counted(NamedTuple):
         return (self.numbers - (self.numbers[0] if first is None else first)) // self.step
 
 
-def count_names(names: Sequence[str]) -> Counted | None:
+def count_names(names: Sequence[str], *, series: bool = False) -> Counted | None:
     """Return the increasing numbers of images in their names.
 
     The names differ in one number, or in several; then the one with the fewest gaps counts. None if no number counts,
-    as in names without digits and in times.
+    as in names without digits and in times. ``series``: numbers may start again, as for poses in a list of their own.
 
     Raises DescriptionError for a mixture of naming, a number that occurs twice, and numbers that decrease or restart.
     """
@@ -60,7 +60,7 @@ def count_names(names: Sequence[str]) -> Counted | None:
         falls = [place for place, (one, two) in enumerate(pairwise(column)) if one > two or (alone and one == two)]
         place = falls[0] if falls else 0
         # Counts of several scans return to 0 or 1; so do seconds and minutes of times, but after 59.
-        again = not alone and column[0] < 2 and all(column[each + 1] == column[0] for each in falls)
+        again = not alone and not series and column[0] < 2 and all(column[each + 1] == column[0] for each in falls)
         in_time = column[place] < 60 <= 2 * column[place] - column[place - 1] + 1
         if falls and (alone or (again and not in_time)):
             same = column[place] == column[place + 1]

@@ -15,6 +15,7 @@ def test_numbers_that_start_again_are_refused(form: str, first: int):
     names = [form.format(scan, number) for scan in (1, 2, 3) for number in range(first, first + 40 + scan)]
     with pytest.raises(DescriptionError, match="are the last and first of two scans: narrow the patterns"):
         count_names(names)
+    assert count_names(names, series=True) is None
     # Numbers that continue are those of one scan.
     continued = count_names([form.format(1 + (number > 20), number) for number in range(first, 40)])
     assert continued is not None and continued.places()[-1] == 39 - first

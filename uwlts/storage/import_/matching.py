@@ -204,7 +204,7 @@ def _add_backgrounds(folder: Path, found: list[str], given: ImportDescription, l
             f"there are {len(found)} background images for {len(laser)} laser images: expected one for all or one for "
             "each, else name them in a table's column background"
         )
-    one, other = count_names(found), count_names([row.file for row in laser])
+    one, other = (count_names(names, series=True) for names in (found, [row.file for row in laser]))
     if one and other and len(found) > 1:
         first = int(one.numbers[0]) if set(one.numbers) & set(other.numbers) else None
         if (one.places(first) != other.places(first)).any():
