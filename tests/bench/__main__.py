@@ -266,9 +266,9 @@ def sensors() -> list[Row]:
     small, rows = sensor_cost(1), []
     for name, finer in FINER.items():
         large = sensor_cost(finer)
-        for of in ("recorded", "labelled", "stripe", "points"):
+        for of, what in WORK.items():
             times = large.per_lit_pixel(of, small)
-            rows.append(at_most(f"{name}, {large.ms[of]:.3g} ms a frame {WORK[of]}: a lit pixel", times, "times", 1.3))
+            rows.append(at_most(f"{name}, a frame {what} per lit pixel, by that of 1.3 Mpx", times, "times", 1.3))
         rows.append(at_most(f"{name}: peak memory", large.peak_gb, "GB", 4))
     return rows
 

@@ -1,4 +1,4 @@
-"""Cost of large image sensors: frames rendered, data sets, stripes and points, by the pixels of the camera."""
+"""Cost of large image sensors: frames rendered, stripes and points, by the pixels of the camera."""
 
 import multiprocessing
 import resource
@@ -6,13 +6,12 @@ import tempfile
 import time
 from dataclasses import dataclass
 from functools import partial
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
 
-import twin
 from tests.bench.rows import median_seconds
+from tests.virtual_sensors import altered
 from twin.recording.record_scene import record_scene
 from twin.rendering_options import Options, use_variant
 from twin.scene.description import load_scene
@@ -28,15 +27,8 @@ FINER = {"5 Mpx": 2, "12 Mpx": 3}
 """Pixels of a large sensor along each side, relative to 1280 x 1024 of the same size on the chip."""
 LIT = 0.02
 """Grey values of lit pixels, of the full scale."""
-WORK = {
-    "recorded": "rendered to disk",
-    "labelled": "of a data set",
-    "stripe": "to find its stripe",
-    "points": "to reconstruct it",
-}
+WORK = {"recorded": "rendered to disk", "stripe": "to find its stripe", "points": "to reconstruct it"}
 """Stages of `Cost`."""
-_FEW, _MANY = 1, 4
-"""Scenes of two data sets, of four frames each: the difference leaves out the start."""
 
 
 @dataclass(frozen=True)
@@ -52,14 +44,12 @@ class Cost:
         return self.ms[of] / self.lit_pixels / (small.ms[of] / small.lit_pixels)
 
 
-def write_finer_sensor(folder: Path, finer: int) -> Path:
-    """Write the thesis's sensor with ``finer`` times as many pixels along each side, on the same chip."""
-    camera, path = load_sensor("thesis").camera, folder / "finer.toml"
-    changed = {"width_px": finer * camera.width_px, "height_px": finer * camera.height_px}
-    changed["pixel_size_um"] = camera.pixel_size_um / finer
-    lines = ['base = "thesis"', "[camera]", *(f"{name} = {value!r}" for name, value in changed.items())]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return path
+def finer_sensor(finer: int) -> Sensor:
+    """Return the thesis's sensor with ``finer`` times as many pixels along each side, on the same chip."""
+    sensor = load_sensor("thesis")
+    camera = sensor.camera
+    pixels = {"width_px": finer * camera.width_px, "height_px": finer * camera.height_px}
+    return altered(sensor, {"camera": pixels | {"pixel_size_um": camera.pixel_size_um / finer}})
 
 
 def sensor_cost(finer: int) -> Cost:
@@ -70,7 +60,7 @@ def sensor_cost(finer: int) -> Cost:
 
 
 def _measure(folder: Path, finer: int) -> Cost:
-    sensor = load_sensor(write_finer_sensor(folder, finer))
+    sensor = finer_sensor(finer)
     images, recorded_ms = _record(folder / "spheres.h5", sensor)
     along, full_dn = sensor.camera.stripe_along, sensor.detector.full_scale_dn()
     medium = sensor.media["water"]
@@ -85,7 +75,6 @@ def _measure(folder: Path, finer: int) -> Cost:
     )
     timed = partial(median_seconds, runs=31, clock=time.process_time)
     ms = {"recorded": recorded_ms, "stripe": 1e3 * timed(find), "points": 1e3 * timed(lambda k: reconstruct())}
-    ms["labelled"] = _labelled_ms(folder)
     lit = float(np.mean([np.count_nonzero(image > LIT * full_dn) for image in images]))
     # ru_maxrss is in KiB.
     return Cost(ms, lit, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9)
@@ -103,16 +92,3 @@ def _record(path: Path, sensor: Sensor) -> tuple[list[np.ndarray], float]:
     with Capture(path) as capture:
         images = [capture.image(k) for k in np.flatnonzero(capture.laser_on).tolist()]
     return images, 1e3 * float(np.median(np.diff(moments)[1:]))
-
-
-def _labelled_ms(folder: Path) -> float:
-    """Return the processor time in ms of a frame of the preset `stripe-clean` with the folder's sensor."""
-    preset = (resources.files("scenes") / "datasets" / "stripe-clean.toml").read_text(encoding="utf-8")
-    path, seconds, frames = folder / "labelled.toml", [], []
-    path.write_text(preset.replace('"thesis-small"', '"finer.toml"'), encoding="utf-8")
-    for scenes in (_FEW, _FEW, _MANY):
-        start, out = time.process_time(), folder / f"set-{len(seconds)}"
-        twin.dataset(path, out=out, scenes=scenes, workers=1)
-        seconds.append(time.process_time() - start)
-        frames.append(len(twin.load_dataset(out)))
-    return 1e3 * (seconds[2] - seconds[1]) / (frames[2] - frames[1])
