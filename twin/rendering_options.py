@@ -43,7 +43,7 @@ class Effects:
 
     def names(self) -> list[str]:
         """Return the names of the rendered effects, as in commands."""
-        return [_option_name(f.name) for f in fields(self) if getattr(self, f.name)]
+        return [_name_option(f.name) for f in fields(self) if getattr(self, f.name)]
 
     def remove(self, *names: str) -> "Effects":
         """Return the effects without some of them; DescriptionError for an unknown name."""
@@ -54,7 +54,7 @@ class Effects:
         return replace(self, **{name.replace("-", "_"): False for name in names})
 
 
-def _flaw(*, off: float, typical: float, least: float, most: float) -> Any:
+def _make_flaw(*, off: float, typical: float, least: float, most: float) -> Any:
     return field(default=off, metadata={"typical": typical, "range": (least, most)})
 
 
@@ -65,55 +65,55 @@ class Flaws:
     Raises DescriptionError if a strength is out of its range.
     """
 
-    glare: float = _flaw(off=0.0, typical=0.02, least=0.0, most=0.5)
+    glare: float = _make_flaw(off=0.0, typical=0.02, least=0.0, most=0.5)
     """Fraction of an image's light that lens and window spread over it: veiling glare (ISO 9358)."""
-    vignetting: float = _flaw(off=0.0, typical=0.4, least=0.0, most=0.99)
+    vignetting: float = _make_flaw(off=0.0, typical=0.4, least=0.0, most=0.99)
     """Relative loss of light at the image's farthest corner, in addition to the cosine-fourth law."""
-    uneven_lamp: float = _flaw(off=0.0, typical=0.6, least=0.0, most=0.99)
+    uneven_lamp: float = _make_flaw(off=0.0, typical=0.6, least=0.0, most=0.99)
     """Relative loss of the lamp's light at half the view's diagonal from its spot, which is off-centre."""
-    particles: float = _flaw(off=0.0, typical=1000.0, least=0.0, most=1e5)
+    particles: float = _make_flaw(off=0.0, typical=1000.0, least=0.0, most=1e5)
     """Number of grains of marine snow above 0.1 mm per litre, rendered individually in the laser's sheet."""
-    bubbles: float = _flaw(off=0.0, typical=200.0, least=0.0, most=1e5)
+    bubbles: float = _make_flaw(off=0.0, typical=200.0, least=0.0, most=1e5)
     """Number of air bubbles above 0.1 mm in diameter per litre, which glint in the sheet."""
-    caustics: float = _flaw(off=0.0, typical=2.0, least=0.0, most=15.0)
+    caustics: float = _make_flaw(off=0.0, typical=2.0, least=0.0, most=15.0)
     """Wind speed in m/s over the water, whose waves focus daylight to moving filaments on surfaces."""
-    stray_light: float = _flaw(off=0.0, typical=0.02, least=0.0, most=0.3)
+    stray_light: float = _make_flaw(off=0.0, typical=0.02, least=0.0, most=0.3)
     """Fraction of the laser's power in a wide pedestal of the sheet, which its optics scatter."""
-    side_lobes: float = _flaw(off=0.0, typical=0.01, least=0.0, most=0.1)
+    side_lobes: float = _make_flaw(off=0.0, typical=0.01, least=0.0, most=0.1)
     """Fraction of the laser's power in the two first side lobes of a beam that its aperture cuts."""
-    lamp_reflection: float = _flaw(off=0.0, typical=0.001, least=0.0, most=0.05)
+    lamp_reflection: float = _make_flaw(off=0.0, typical=0.001, least=0.0, most=0.05)
     """Reflectance of the camera's window for a ring lamp around the lens, which appears out of focus."""
-    dirt: float = _flaw(off=0.0, typical=0.1, least=0.0, most=0.9)
+    dirt: float = _make_flaw(off=0.0, typical=0.1, least=0.0, most=0.9)
     """Fraction of the camera's window that is covered with spots, which darken blurred patches of the image."""
-    ghost: float = _flaw(off=0.0, typical=0.003, least=0.0, most=0.1)
+    ghost: float = _make_flaw(off=0.0, typical=0.003, least=0.0, most=0.1)
     """Fraction of an image's light that image sensor and lens reflect to a blurred image, mirrored at the axis."""
     lamp_and_laser: bool = False
     """Lamp and laser are on in every image, so that it shows stripe and board."""
-    pixel_aspect: float = _flaw(off=1.0, typical=1.002, least=0.9, most=1.1)
+    pixel_aspect: float = _make_flaw(off=1.0, typical=1.002, least=0.9, most=1.1)
     """Width of a pixel divided by its height: ratio of the focal lengths in px along y and x."""
-    tangential: float = _flaw(off=0.0, typical=1e-3, least=-0.1, most=0.1)
+    tangential: float = _make_flaw(off=0.0, typical=1e-3, least=-0.1, most=0.1)
     """Increment of the tangential distortion p1 of the lens as built."""
-    rolling_shutter: float = _flaw(off=0.0, typical=10.0, least=0.0, most=1000.0)
+    rolling_shutter: float = _make_flaw(off=0.0, typical=10.0, least=0.0, most=1000.0)
     """Delay in us between rows of a rolling shutter; visible while the stage moves."""
-    row_noise: float = _flaw(off=0.0, typical=5.0, least=0.0, most=1000.0)
+    row_noise: float = _make_flaw(off=0.0, typical=5.0, least=0.0, most=1000.0)
     """Standard deviation in electrons of an offset that all pixels of a row share, different in each image."""
-    jpeg: int = _flaw(off=0, typical=90, least=1, most=100)
+    jpeg: int = _make_flaw(off=0, typical=90, least=1, most=100)
     """Quality of JPEG compression; 8-bit images only."""
     colour_filter: bool = False
     """Colour image sensor (RGGB) instead of a monochrome one; its red channel is recorded."""
-    camera_3d: int = _flaw(off=0, typical=16, least=1, most=32)
+    camera_3d: int = _make_flaw(off=0, typical=16, least=1, most=32)
     """Steps per pixel of a 3D camera, which detects the stripe itself: laser images are recorded as centre lines."""
 
     def __post_init__(self) -> None:
         for each in fields(self):
             value, (least, most) = getattr(self, each.name), each.metadata.get("range", (False, True))
             if value != each.default and not least <= value <= most:
-                raise DescriptionError(f"{_option_name(each.name)} is {value:g}; it must be from {least:g} to {most:g}")
+                raise DescriptionError(f"{_name_option(each.name)} is {value:g}; it must be from {least:g} to {most:g}")
 
     def names(self) -> list[str]:
         """Return the names of the rendered flaws, as in commands."""
         present = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) != f.default}
-        return [_option_name(name) + ("" if value is True else f"={value:.9g}") for name, value in present.items()]
+        return [_name_option(name) + ("" if value is True else f"={value:.9g}") for name, value in present.items()]
 
     @classmethod
     def parse(cls, *texts: str) -> "Flaws":
@@ -121,7 +121,7 @@ class Flaws:
 
         Raises DescriptionError if a name is unknown, or a strength is not a number, out of its range, or not allowed.
         """
-        known = {_option_name(each.name): each for each in fields(cls)}
+        known = {_name_option(each.name): each for each in fields(cls)}
         strengths: dict[str, Any] = {}
         for text in texts:
             name, equals, value = text.partition("=")
@@ -141,7 +141,7 @@ class Flaws:
         return cls(**strengths)
 
 
-def _option_name(field_name: str) -> str:
+def _name_option(field_name: str) -> str:
     """Return the name of an effect as in commands."""
     return field_name.replace("_", "-")
 

@@ -42,11 +42,11 @@ _MISFIT = object()
 @contextmanager
 def protect_inputs(arguments: Mapping[str, object]) -> Iterator[None]:
     """Protect the files that arguments name as inputs: in this context `refuse_input` refuses them as outputs."""
-    named = [name for key in arguments.keys() - _WRITTEN for name in _file_names(arguments[key])]
+    named = [name for key in arguments.keys() - _WRITTEN for name in _list_file_names(arguments[key])]
     token = _inputs.set((*_inputs.get(), *filter(os.path.isfile, named)))
     try:
         for key in OUTPUTS.intersection(arguments):
-            for name in _file_names(arguments[key]):
+            for name in _list_file_names(arguments[key]):
                 refuse_input(name)
         yield
     finally:
@@ -61,14 +61,14 @@ def refuse_input(target: str | os.PathLike[str]) -> None:
             raise OutputError(f"cannot write {target}: it is an input of this command{also}; give another name")
 
 
-def _file_names(value: object) -> Iterable[str]:
+def _list_file_names(value: object) -> Iterable[str]:
     """Iterate over names of files that an argument may contain, also after a prefix, as in replay:PATH."""
     if isinstance(value, str | os.PathLike):
         name = os.fspath(value)
         yield from (name, name.partition(":")[2])
     elif isinstance(value, Sequence) and not isinstance(value, bytes):
         for each in value:
-            yield from _file_names(each)
+            yield from _list_file_names(each)
 
 
 def attach_public(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
@@ -102,7 +102,7 @@ def check_arguments(function: Callable[P, R], *, keep_inputs: bool = False) -> C
             bound = signature.bind(*args, **kwargs)
         except TypeError:
             return function(*args, **kwargs)  # Python's message has the function's name
-        hints = _hints(function)
+        hints = _read_hints(function)
         for name, value in bound.arguments.items():
             kind = signature.parameters[name].kind
             if name not in hints or kind is inspect.Parameter.VAR_KEYWORD:
@@ -117,7 +117,7 @@ def check_arguments(function: Callable[P, R], *, keep_inputs: bool = False) -> C
 
 
 @cache
-def _hints(function: Callable[..., Any]) -> dict[str, Any]:
+def _read_hints(function: Callable[..., Any]) -> dict[str, Any]:
     """Return the types of a function's parameters; that of its result may be unknown when it runs."""
     annotations = {name: hint for name, hint in inspect.get_annotations(function).items() if name != "return"}
     return get_type_hints(
@@ -227,11 +227,11 @@ def _describe(hint: Any) -> str:
     """Return the expected types as text; None, which the signature shows as default, is left out."""
     kinds = [kind for kind in union_members(hint) if kind is not NoneType]
     named = any(map(_is_path, kinds))
-    names = list(dict.fromkeys(word for kind in kinds for word in _words(kind, beside_path=named)))
+    names = list(dict.fromkeys(word for kind in kinds for word in _name_kinds(kind, beside_path=named)))
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
 
 
-def _words(kind: Any, *, beside_path: bool) -> list[str]:
+def _name_kinds(kind: Any, *, beside_path: bool) -> list[str]:
     origin, parts = get_origin(kind) or kind, get_args(kind)
     plain = {str: "text", int: "a whole number", float: "a number", bool: "True or False"}
     if _is_path(kind) or (kind is str and beside_path):

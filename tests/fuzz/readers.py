@@ -31,7 +31,7 @@ from twin.experiments.figures import load_published
 from twin.scene.campaign import load_campaign
 from twin.scene.description import Mesh, load_scene
 from twin.scene.finish import read_grey
-from twin.scene.objects import _surface_from_file
+from twin.scene.objects import _load_surface
 from uwlts.acceptance.accept import read_acceptance
 from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.mount.calibrate_mount import calibrate_mount
@@ -305,7 +305,7 @@ def _mesh(path: Path) -> None:
 
 
 def _read_mesh(path: Path) -> None:
-    _surface_from_file(Mesh(kind="mesh", path=str(path)))
+    _load_surface(Mesh(kind="mesh", path=str(path)))
 
 
 def _glb(path: Path) -> None:

@@ -303,7 +303,7 @@ assert table["near_mm"] >= 149.9 and table["line_mm"] >= 159.9
     ),
     "docs/tutorials/learn-from-a-data-set.md": Page(
         instead={
-            "scenes=50": "scenes=4",
+            "scenes=12": "scenes=4",
             'base = "stripe-turbid"': 'base = "stripe-clean"\nsensor = "thesis-small"\n'
             "splits = { train = 0.8, test = 0.2, validation = 0 }",
         }

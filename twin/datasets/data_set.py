@@ -125,7 +125,7 @@ class Normal(Description):
 
     @model_validator(mode="after")
     def _check_range(self) -> Self:
-        low, high = self._ends()
+        low, high = self._find_ends()
         if high - low < 1e-6:
             raise ValueError(
                 f"less than a millionth of the normal distribution with mean {self.mean:g} and std {self.std:g} is "
@@ -135,10 +135,10 @@ class Normal(Description):
 
     def quantile(self, share: float) -> float:
         """Return the quantile of a probability."""
-        low, high = self._ends()
+        low, high = self._find_ends()
         return float(self.mean + self.std * ndtri(low + share * (high - low)))
 
-    def _ends(self) -> tuple[float, float]:
+    def _find_ends(self) -> tuple[float, float]:
         low = 0.0 if self.least is None else float(ndtr((self.least - self.mean) / self.std))
         return low, 1.0 if self.most is None else float(ndtr((self.most - self.mean) / self.std))
 
@@ -223,7 +223,7 @@ class DataSetDescription(Description):
         self.options(seed=0)
         whole = set()
         for path, distribution in self.vary.items():
-            found = self._base_value(path)
+            found = self._look_up_base(path)
             ends = [distribution.quantile(share) for share in (1e-3, 0.5)]
             if isinstance(found, int) and not isinstance(found, bool):
                 whole.add(path)
@@ -261,10 +261,10 @@ class DataSetDescription(Description):
         """Return the quantile of a path's distribution at a probability from 0 to 1, rounded for integers."""
         value = self.vary[path].quantile(share)
         if path.endswith((".path", ".texture")):  # from the folder of the scene, as in its file
-            return str(Path(str(self._base_value(path))).parent / str(value))
+            return str(Path(str(self._look_up_base(path))).parent / str(value))
         return round(value) if path in self._whole and not isinstance(value, str) else value
 
-    def _base_value(self, path: str) -> Value | None:
+    def _look_up_base(self, path: str) -> Value | None:
         """Return the value of a path in the base description; DescriptionError if the path is unknown."""
         root, _, rest = path.partition(".")
         if path == EXPOSURE:

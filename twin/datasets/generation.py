@@ -112,7 +112,7 @@ def write_card(
         update={
             "redrawn": len(redrawn),
             "labels": {name: MEANINGS[name] for name in names},
-            "drawn": {path: _summary(drawn) for path, drawn in values.items()},
+            "drawn": {path: _summarise(drawn) for path, drawn in values.items()},
             "status": {LineStatus(number).name.lower(): count for number, count in sorted(status.items())},
         }
     )
@@ -124,7 +124,7 @@ def write_card(
     return card
 
 
-def _summary(values: Sequence[Value]) -> dict[str, float | str]:
+def _summarise(values: Sequence[Value]) -> dict[str, float | str]:
     if any(isinstance(value, str | bool) for value in values):
         return {str(value): float(count) for value, count in sorted(Counter(map(str, values)).items())}
     numbers = np.array(values, float)
@@ -267,7 +267,7 @@ def dataset(
     require_at_least(1, workers=workers)
     described, folder = load_description(description, scenes=scenes, seed=seed), Path(out)
     draw_scene(described, 0)
-    jobs = _jobs(described, folder, variant)
+    jobs = _list_jobs(described, folder, variant)
     versions: dict[str, JsonValue] = {package: version(package) for package in ("uwlts", "mitsuba", "drjit")}
     plan = {"description": described.model_dump(mode="json"), "variant": variant, "versions": versions}
     make_folder(folder)
@@ -320,7 +320,7 @@ class _Job:
         return len(self.scenes) * self.description.scene.motion.images()
 
 
-def _jobs(description: DataSetDescription, folder: Path, variant: str) -> list[_Job]:
+def _list_jobs(description: DataSetDescription, folder: Path, variant: str) -> list[_Job]:
     """Return all shards, sorted by first scene."""
     members: dict[Split, list[int]] = {split: [] for split in SPLITS}
     for scene in range(description.scenes):

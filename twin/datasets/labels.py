@@ -58,7 +58,7 @@ def make_labels(
     arrays: dict[str, np.ndarray] = {}
     noise = noise_std_e(taken, simulator.sensor.detector, row_noise_e=simulator.options.flaws.row_noise)
     if {"centre", "quality", "points"} & set(wanted):
-        lines = _line_labels(simulator, shot, taken, noise)
+        lines = _make_line_labels(simulator, shot, taken, noise)
         names: dict[str, tuple[str, ...]] = {"centre": ("centre_px", "centroid_px", "status")}
         names["quality"] = "width_px", "snr", "bound_px", "visible_fraction", "mixed_fraction"
         names["points"] = "point_mm", "normal", "object"
@@ -74,14 +74,14 @@ def make_labels(
         light = np.stack([taken.direct, taken.scattered_once, taken.indirect, taken.particles, taken.even])
         arrays["light_e"] = np.minimum(light, _LARGEST_HALF).astype(np.float16)
     if "target" in wanted:
-        arrays["target_px"] = _target_points(simulator, shot)
+        arrays["target_px"] = _find_target_points(simulator, shot)
     if "depth" in wanted:
         depth, number = find_visible_surfaces(simulator.renderer, simulator.pose(shot))
         arrays |= {"depth_mm": depth, "object_map": np.where(number < 0, NO_OBJECT, number).astype(np.uint8)}
     return arrays
 
 
-def _line_labels(
+def _make_line_labels(
     simulator: SensorSimulator, shot: Shot, taken: SimulatedImage, noise: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Return all labels of the profile lines of a shot."""
@@ -108,7 +108,7 @@ def _line_labels(
     return {name: values.astype(np.float32) for name, values in floats.items()} | {"status": status, "object": number}
 
 
-def _target_points(simulator: SensorSimulator, shot: Shot) -> np.ndarray:
+def _find_target_points(simulator: SensorSimulator, shot: Shot) -> np.ndarray:
     """Return the image points (N, 2), float32, of the scene's first calibration target."""
     from twin.recording.frame_truth import project_points
 

@@ -50,11 +50,11 @@ def find_pareto_front(values: np.ndarray) -> np.ndarray:
     front = np.zeros(len(values), dtype=bool)
     candidates = np.flatnonzero(~np.isnan(values).any(axis=1))
     if len(candidates):
-        front[candidates] = (_front_of_two if values.shape[1] <= 2 else _front_of_many)(values[candidates])
+        front[candidates] = (_find_front_of_two if values.shape[1] <= 2 else _find_front_of_many)(values[candidates])
     return front
 
 
-def _front_of_two(values: np.ndarray) -> np.ndarray:
+def _find_front_of_two(values: np.ndarray) -> np.ndarray:
     """Return the front of one or two values.
 
     Sorted by the first value, a design is on the front if its second value is smaller than all before.
@@ -70,7 +70,7 @@ def _front_of_two(values: np.ndarray) -> np.ndarray:
     return front
 
 
-def _front_of_many(values: np.ndarray) -> np.ndarray:
+def _find_front_of_many(values: np.ndarray) -> np.ndarray:
     """Return the front by elimination: the lexicographically first of the remaining designs is always on it."""
     left = np.lexsort(values.T[::-1])
     front = np.zeros(len(values), dtype=bool)
@@ -217,7 +217,7 @@ Mean = Callable[..., Array]
 Smooth = Callable[[ModuleType, SensorArrays, Field, Mean], Array]
 
 
-def _rms(name: str, depth: int | None = None) -> Smooth:
+def _make_rms(name: str, depth: int | None = None) -> Smooth:
     """Return a function for the root mean square of a quantity over all points, or over those at one depth."""
     return lambda xp, p, f, mean: xp.sqrt(mean(getattr(f, name) ** 2, depth))
 
@@ -227,19 +227,19 @@ def _choose_largest(xp: ModuleType, values: Array) -> Array:
     return xp.gather(type(values), values, int(np.argmax(values.numpy())))
 
 
-def _coverage(xp: ModuleType, p: SensorArrays, f: Field, mean: Mean) -> Array:
+def _compute_coverage(xp: ModuleType, p: SensorArrays, f: Field, mean: Mean) -> Array:
     near, far = find_depths_in_view(xp, p)
     return (far - near) / (p.far_mm - p.near_mm)
 
 
 MIDDLE = DEPTHS // 2  # index of the middle depth
 SMOOTH: dict[str, Smooth] = {
-    "sigma_z_rms_mm": _rms("sigma_z_mm"),
+    "sigma_z_rms_mm": _make_rms("sigma_z_mm"),
     "sigma_z_mm": lambda xp, p, f, mean: _choose_largest(xp, f.sigma_z_mm),
     "sigma_y_mm": lambda xp, p, f, mean: _choose_largest(xp, f.sigma_y_mm),
-    "sigma_z_near_mm": _rms("sigma_z_mm", 0),
-    "sigma_z_middle_mm": _rms("sigma_z_mm", MIDDLE),
-    "sigma_z_far_mm": _rms("sigma_z_mm", DEPTHS - 1),
+    "sigma_z_near_mm": _make_rms("sigma_z_mm", 0),
+    "sigma_z_middle_mm": _make_rms("sigma_z_mm", MIDDLE),
+    "sigma_z_far_mm": _make_rms("sigma_z_mm", DEPTHS - 1),
     "line_near_mm": lambda xp, p, f, mean: 2 * mean(f.half_line_mm, 0),
     "line_mm": lambda xp, p, f, mean: 2 * mean(f.half_line_mm, MIDDLE),
     "line_far_mm": lambda xp, p, f, mean: 2 * mean(f.half_line_mm, DEPTHS - 1),
@@ -249,7 +249,7 @@ SMOOTH: dict[str, Smooth] = {
     "far_mm": lambda xp, p, f, mean: p.far_mm,
     "depth_mm": lambda xp, p, f, mean: p.far_mm - p.near_mm,
     "baseline_mm": lambda xp, p, f, mean: p.baseline_mm,
-    "coverage": _coverage,
+    "coverage": _compute_coverage,
 }
 """Differentiable figures. For coverage, the laser is assumed to reach everything in the camera's view."""
 

@@ -112,7 +112,7 @@ def evaluate_designs(study: Study, designs: Sequence[Design]) -> Columns:
     The columns are "design" (the number), the free variables, all `Figures`, "violation" and "failure", see
     `EvaluatedDesign`. A design that fails has NaN figures and an infinite violation.
     """
-    parameters, places, failures = _parameters(study, designs)
+    parameters, places, failures = _make_parameters(study, designs)
     columns = make_failed_columns(study, designs, failures)
     if parameters is not None:
         options = {"reflectance": study.reflectance, "water_depth_m": study.water_depth_m, "follow": study.follow}
@@ -125,7 +125,7 @@ def evaluate_designs(study: Study, designs: Sequence[Design]) -> Columns:
     return columns
 
 
-def _parameters(study: Study, designs: Sequence[Design]) -> tuple[SensorArrays | None, np.ndarray, list[str]]:
+def _make_parameters(study: Study, designs: Sequence[Design]) -> tuple[SensorArrays | None, np.ndarray, list[str]]:
     """Return the parameters of the M valid designs of N, their indices (M,), and the reasons (N,) of the others.
 
     Designs that differ only in numbers of `PARAMETER_OF` are validated together, at all corners of the box of these

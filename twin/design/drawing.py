@@ -90,7 +90,7 @@ def make_view(sensor: Sensor, medium: Medium) -> SideView:
     sideways = math.hypot(*pose.normal[:2])
     across = pose.normal[:2] / sideways * (-1 if pose.normal[:2] @ pose.origin_mm[:2] < 0 else 1)
     side_axes = np.array([[*across, 0.0], ahead])
-    border = trace_pixels(camera, _border_towards(camera, across))
+    border = trace_pixels(camera, _find_border(camera, across))
     return SideView(
         camera=_project(pupil, ahead, camera.window, windows[0], side_axes),
         laser=_project(pose.origin_mm, pose.axis, sensor.laser.window, windows[1], side_axes),
@@ -136,7 +136,7 @@ def _project(
     return Module(view @ origin, np.array([inner - along, inner + along, outer + along, outer - along]))
 
 
-def _border_towards(camera: Camera, across: np.ndarray) -> np.ndarray:
+def _find_border(camera: Camera, across: np.ndarray) -> np.ndarray:
     """Return the border pixels (2, 2) in the directions +-``across`` (2,) from the principal point."""
     centre = np.array(camera.principal_point())
     least, most = np.array([-0.5, -0.5]), np.array([camera.width_px - 0.5, camera.height_px - 0.5])
@@ -179,7 +179,7 @@ def _fill(axes: Axes, points: np.ndarray, colour: str, alpha: float) -> None:
         axes.fill(*points.T, facecolor=colour, alpha=alpha)
 
 
-def _dimension(axes: Axes, start: tuple[float, float], end: tuple[float, float], text: str) -> None:
+def _draw_dimension(axes: Axes, start: tuple[float, float], end: tuple[float, float], text: str) -> None:
     """Draw a dimension line between two points, with a text beside its middle."""
     arrow = {"arrowstyle": "<->", "color": INK, "linewidth": 0.8, "shrinkA": 0, "shrinkB": 0}
     axes.annotate("", start, end, arrowprops=arrow)
@@ -219,8 +219,8 @@ def _draw_side(axes: Axes, view: SideView, *, labels_at: float) -> None:
     if abs(view.baseline_mm - shown) > 1e-3 * view.baseline_mm:
         # The baseline is not perpendicular to the stripe.
         text = f"{number_text(shown)} mm of the {text}"
-    _dimension(axes, (0.0, 0.75 * top), (shown, 0.75 * top), text)
-    _dimension(axes, (0.8 * left, outer), (0.8 * left, cross), f"stand-off {number_text(cross - outer)} mm")
+    _draw_dimension(axes, (0.0, 0.75 * top), (shown, 0.75 * top), text)
+    _draw_dimension(axes, (0.8 * left, outer), (0.8 * left, cross), f"stand-off {number_text(cross - outer)} mm")
     for depth in (outer, cross):
         axes.plot([0.8 * left, 0.0], [depth, depth], color=_BEHIND, linewidth=0.6)
     axes.set(xlabel="across the stripe / mm", ylabel="depth from the pupil / mm")

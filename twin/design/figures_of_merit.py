@@ -372,7 +372,7 @@ def compute_figures(
         shape = np.broadcast_shapes(f.sigma_z_mm.shape, (p.near_mm.size, DEPTHS, PLACES))
         full = {name: np.broadcast_to(np.asarray(values, dtype=float), shape) for name, values in vars(f).items()}
         figures = _reduce_fields(p, full, (far - near) / (p.far_mm - p.near_mm), water_depth_m=water_depth_m)
-        reasons = _reasons(p, figures, full)
+        reasons = _find_reasons(p, figures, full)
     return figures, reasons
 
 
@@ -487,7 +487,7 @@ def _reduce_fields(p: SensorArrays, f: dict[str, np.ndarray], share: np.ndarray,
     )
 
 
-def _reasons(p: SensorArrays, figures: Figures, f: dict[str, np.ndarray]) -> list[str]:
+def _find_reasons(p: SensorArrays, figures: Figures, f: dict[str, np.ndarray]) -> list[str]:
     """Return for each of N designs the first reason why it cannot work, "" if it works."""
     one = p.each
     corner = np.hypot(p.width_px, p.height_px / p.pixel_aspect) / 2 * p.pixel_mm / p.focal_mm

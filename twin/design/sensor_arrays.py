@@ -166,20 +166,20 @@ class SensorArrays:
         size = self.width_px, self.height_px
         return SheetGeometry(lens, self.window(xp), self.pose(xp), self.along_width, *size)
 
-    def _normal(self, xp: ModuleType) -> Vector:
+    def _compute_normal(self, xp: ModuleType) -> Vector:
         """Return the unit normal of the camera's window, as `uwlts.model.sensor.Window.normal`."""
         x, y = self.window_tilt_x_rad, self.window_tilt_y_rad
         return xp.cos(x) * xp.sin(y), -xp.sin(x), xp.cos(x) * xp.cos(y)
 
     def window(self, xp: ModuleType) -> WindowGeometry:
         """Return the camera's window; if it is not mounted, one of zero thickness in the pupil, with air behind it."""
-        normal, mounted = self._normal(xp), self.window_mounted
+        normal, mounted = self._compute_normal(xp), self.window_mounted
         distance, thickness = mounted * self.window_distance_mm * normal[2], mounted * self.window_thickness_mm
         return WindowGeometry(normal, distance, thickness, self.window_index, self.medium_index)
 
     def outer_mm(self, xp: ModuleType) -> Array:
         """Return the depth of the window's outer face on the camera's axis, mounted or not: origin of the volume."""
-        return self.window_distance_mm + self.window_thickness_mm / self._normal(xp)[2]
+        return self.window_distance_mm + self.window_thickness_mm / self._compute_normal(xp)[2]
 
     def laser_window(self, axis: Vector) -> WindowGeometry:
         """Return the laser's window, assumed normal to its axis."""
@@ -188,7 +188,7 @@ class SensorArrays:
 
     def pixel_contrast(self, xp: ModuleType) -> Array:
         """Return the speckle contrast of a pixel, averaged over its area and two incoherent polarisations."""
-        return self._evaluate_grain_average(xp, _pixel_series()) * self.speckle_coherence / math.sqrt(2)
+        return self._evaluate_grain_average(xp, _fit_pixel_series()) * self.speckle_coherence / math.sqrt(2)
 
     def centre_contrast(self, xp: ModuleType, sigma_px: Array) -> Array:
         """Return the effective contrast: the one with the same effect for uncorrelated neighbours across the stripe.
@@ -202,7 +202,7 @@ class SensorArrays:
         v = xp.minimum(frequency * self.grain_px(), 0.999)
         lens = 2 / math.pi * (xp.acos(v) - v * xp.sqrt(1 - v * v))
         pixel = xp.sin(math.pi * frequency) / (math.pi * frequency)
-        whole = self._evaluate_grain_average(xp, _line_series()) * self.speckle_coherence / math.sqrt(2)
+        whole = self._evaluate_grain_average(xp, _fit_line_series()) * self.speckle_coherence / math.sqrt(2)
         return whole * xp.sqrt(lens) * pixel
 
     def grain_px(self) -> Array:
@@ -243,13 +243,13 @@ def stack_parameters(rows: Sequence[SensorArrays]) -> SensorArrays:
         nodes = max(map(len, columns[name]))
         # Short tables are padded with their last node, which changes nothing.
         columns[name] = [(*table, *table[-1:] * (nodes - len(table))) for table in columns[name]]
-    return SensorArrays(**{name: _columns(values) for name, values in columns.items()})
+    return SensorArrays(**{name: _make_column(values) for name, values in columns.items()})
 
 
-def _columns(values: Sequence[Array]) -> Array:
+def _make_column(values: Sequence[Array]) -> Array:
     """Return an array (N, 1, 1) of N numbers, or a tuple of arrays for N tuples of numbers."""
     if isinstance(values[0], tuple):
-        return tuple(_columns(parts) for parts in zip(*values, strict=True))
+        return tuple(_make_column(parts) for parts in zip(*values, strict=True))
     return np.array(values, dtype=np.float64).reshape(-1, 1, 1)
 
 
@@ -339,14 +339,14 @@ def extract_numbers(sensor: Sensor, medium: Medium) -> SensorArrays:
 
 
 @cache
-def _pixel_series() -> Chebyshev:
+def _fit_pixel_series() -> Chebyshev:
     """Return the log contrast after averaging over a pixel, as a series in the log grain size in px (error 0.5 %)."""
     grains = np.geomspace(*_GRAINS_PX, 60)
     return Chebyshev.fit(np.log(grains), np.log([pixel_contrast(float(grain)) for grain in grains]), 12)
 
 
 @cache
-def _line_series() -> Chebyshev:
+def _fit_line_series() -> Chebyshev:
     """Return half the log of the squared contrast, summed over neighbours across the stripe, by log grain size.
 
     The correlation |2 J1(z) / z|^2 of speckle is summed over pixel lags across the stripe and averaged within a pixel

@@ -299,7 +299,7 @@ def page_text(
             for found in agreements
             for drawn in [verification_chart(found)]
         ],
-        best=_rows_of(judged, judged.best_first[:_BEST]),
+        best=_list_designs(judged, judged.best_first[:_BEST]),
         best_of_each=best_of_each(judged),
         failures=tables.failure_counts(judged),
         misses=[
@@ -320,10 +320,10 @@ def best_of_each(judged: StudyResults) -> tuple[list[str], list[list[str]]] | No
     found: dict[tuple[int, ...], int] = {}
     for place in judged.best_first.tolist():
         found.setdefault(tuple(values[name].index(judged.columns[name][place]) for name in chosen), place)
-    return _rows_of(judged, [found[each] for each in sorted(found)][: 3 * _BEST], first=chosen) if chosen else None
+    return _list_designs(judged, [found[each] for each in sorted(found)][: 3 * _BEST], first=chosen) if chosen else None
 
 
-def _rows_of(
+def _list_designs(
     judged: StudyResults, places: Sequence[int] | np.ndarray, *, first: Sequence[str] = ()
 ) -> tuple[list[str], list[list[str]]]:
     """Return the head and rows of a table of designs, with the ``first`` names in the first columns."""

@@ -163,8 +163,8 @@ def plan_recordings(sensor: Sensor, medium: str, *, reflectance: float) -> Recor
     length = 2 * _OVERSIZE * float(max(at_far[-1] - y, y - at_far[0]))
     plane = {"kind": "plate", "position_mm": (0.0, y, 0.0), "reflectance": reflectance}
     plane |= {"width_mm": length, "height_mm": length}
-    motion = _travel(near, far, STANDARD_DEPTHS)
-    scene = _scene("Plane standard", medium, motion=motion, objects=[plane], artefact={"kind": "plane"})
+    motion = _plan_travel(near, far, STANDARD_DEPTHS)
+    scene = _make_scene("Plane standard", medium, motion=motion, objects=[plane], artefact={"kind": "plane"})
     standard = PlannedRecording("standard", sensor, scene)
     exposed = Exposure.model_validate(sensor.exposure.model_dump() | {"laser_ms": "auto", "lamp_ms": "auto"})
     calibrated = sensor.model_copy(update={"exposure": exposed})
@@ -223,22 +223,22 @@ def _step(medium: str, *, near: float, far: float, y: float, length: float) -> S
         }
         for side, front in ((-1, height / 2), (1, -height / 2))
     ]
-    return _scene(
+    return _make_scene(
         "Step standard",
         medium,
-        motion=_travel(near + height / 2, far - height / 2, STEP_DEPTHS),
+        motion=_plan_travel(near + height / 2, far - height / 2, STEP_DEPTHS),
         objects=blocks,
         artefact={"kind": "step", "height_mm": height, "edge_mm": _EDGE * length},
     )
 
 
-def _travel(near: float, far: float, count: int) -> dict[str, object]:
+def _plan_travel(near: float, far: float, count: int) -> dict[str, object]:
     """Return the motion through depths Z of the scene's origin, from far to near."""
     step = (far - near) / (count - 1)
     return {"start_mm": -far, "step_mm": step, "count": count, "direction": (0.0, 0.0, 1.0)}
 
 
-def _scene(title: str, medium: str, **rest: object) -> Scene:
+def _make_scene(title: str, medium: str, **rest: object) -> Scene:
     return validate_description(Scene, {"title": title, "medium": medium} | rest, title)
 
 
@@ -252,12 +252,12 @@ def _target(sensor: Sensor, medium: str, sight: LineOfSight, *, near: float, far
     sharp = depths[find_longest_run(sight.blur_px(depths) <= _LARGEST_BLUR_PX)]
     # The size of the circles depends on the range, and the range with complete marks on their size. The circles must
     # be large enough in the image at all depths, under oblique view and out of focus.
-    roughly = _marks_in_view(sight, sharp, 0.0, y)
+    roughly = _find_marks_in_view(sight, sharp, 0.0, y)
     ends, aslant = roughly[[0, -1]], sight.pose[2, 2]
     least = np.maximum(_SMALLEST_CIRCLE_PX / aslant, _CIRCLE_BLURS * sight.blur_px(ends)) * ends
     usual = _CIRCLE_PX / aslant * math.sqrt(ends[0] * ends[1])
     diameter = round(float(max(usual, *least)) / sight.camera.focal_length_px(), 4)
-    z = sight.z_at(_marks_in_view(sight, roughly, diameter, y))
+    z = sight.z_at(_find_marks_in_view(sight, roughly, diameter, y))
     spacing = 2 * diameter
     columns, rows = (math.ceil(side / spacing) for side in sight.half_target_mm(z[-1], y))
     lattice = {
@@ -280,10 +280,10 @@ def _target(sensor: Sensor, medium: str, sight: LineOfSight, *, near: float, far
         "circle_reflectance": 0.8,
         "marker_reflectance": 0.03,
     }
-    scene = _scene(
+    scene = _make_scene(
         "Circle target",
         medium,
-        motion=_travel(float(z[0]), float(z[-1]), TARGET_POSES) | {"lights": ("lamp", "laser")},
+        motion=_plan_travel(float(z[0]), float(z[-1]), TARGET_POSES) | {"lights": ("lamp", "laser")},
         objects=[plate],
         target={"kind": "circles"} | lattice,
         window_mounted=sight.camera.window.mounted,
@@ -295,7 +295,7 @@ def _target(sensor: Sensor, medium: str, sight: LineOfSight, *, near: float, far
     return PlannedRecording("target", sensor.model_copy(update={"volume": volume}), scene)
 
 
-def _marks_in_view(sight: LineOfSight, depths: np.ndarray, diameter: float, y: float) -> np.ndarray:
+def _find_marks_in_view(sight: LineOfSight, depths: np.ndarray, diameter: float, y: float) -> np.ndarray:
     """Return the depths with all three marks completely in view; DesignError if there are fewer than two."""
     spacing = 2 * diameter
     centres = np.array([(-spacing / 2, y), (spacing / 2, y), (-spacing / 2, y + spacing)])

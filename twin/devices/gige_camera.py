@@ -201,7 +201,7 @@ class GigeCamera:
         self.failure: BaseException | None = None
         self._frame, self._scan3d, self._encoder, self._expose = frame, scan3d, encoder, expose
         self._size = (height_px, width_px)
-        self._library = _functions()
+        self._library = _load_functions()
         # The library does not keep a reference to the callback.
         self._callback = _FILL(self._fill)
         self._server: int | None = None
@@ -357,7 +357,7 @@ class GigeCamera:
             raise
         counts = () if exposed.encoder is None else (exposed.encoder,)
         shot = _Shot(seen, (round(1e9 * exposed.middle_s - 0.5e6 * exposure_ms),), counts)
-        if self._of_profiles():
+        if self._sends_profiles():
             # Profiles are collected until a frame is full; another port indicates another acquisition.
             port, (gathered_for, gathered) = self._read_register(_Register.STREAM_PORT), self._gathered
             shot = shot if gathered is None or gathered_for != port else gathered + shot
@@ -445,9 +445,9 @@ class GigeCamera:
 
     def _convert_image(self, image: np.ndarray) -> np.ndarray:
         """Return the image, or a 3D camera's profile (1, L) of it."""
-        return self._scan3d.numbers(image)[None] if self._scan3d is not None and self._of_profiles() else image
+        return self._scan3d.numbers(image)[None] if self._scan3d is not None and self._sends_profiles() else image
 
-    def _of_profiles(self) -> bool:
+    def _sends_profiles(self) -> bool:
         return self._scan3d is not None and self._read_register(_Register.PIXEL_FORMAT) == _COORD3D_C16
 
     def _read_register(self, register: int) -> int:
@@ -465,7 +465,7 @@ class GigeCamera:
         self._maker_thread.shutdown(cancel_futures=True)
 
 
-def _functions() -> SimpleNamespace:
+def _load_functions() -> SimpleNamespace:
     """Return the library's functions with their types, for this module only."""
     library, functions = load_aravis(), SimpleNamespace()
     for name, (result, arguments) in _FUNCTIONS.items():

@@ -89,7 +89,7 @@ class GrblController:
         self._lights: list[LitTime] = []
         all_settings = {**BENCH_SETTINGS, **(settings or {})}
         self._firmware = GrblFirmware(
-            all_settings, position_mm=position_mm, clock=self._now, say=self._say, speed_up=speed_up, **build
+            all_settings, position_mm=position_mm, clock=self._read_clock, say=self._say, speed_up=speed_up, **build
         )
 
     def __enter__(self) -> "GrblController":
@@ -141,7 +141,7 @@ class GrblController:
         """Pull the cable, which also cuts the controller's power."""
         with self._lock:
             if self._powered:
-                self._firmware.axis.stop(self._now())
+                self._firmware.axis.stop(self._read_clock())
                 self._powered = False
                 os.close(self._master)
                 self._log_light()
@@ -161,7 +161,7 @@ class GrblController:
                 case "cut-line":  # both data lines break; the controller keeps its power
                     self._muted = self._cut = bool(value)
                 case "stall":  # blocked until a reset, while the controller reports "Run"
-                    firmware.axis.stick(self._now())
+                    firmware.axis.stick(self._read_clock())
                 case "stop-short":  # commands or pulses lost in the controller
                     firmware.short_steps = int(value)
                 case "lose-steps":  # the motor slips, which the controller cannot detect
@@ -220,5 +220,5 @@ class GrblController:
             if error.errno not in (errno.EAGAIN, errno.EIO):
                 raise
 
-    def _now(self) -> float:
+    def _read_clock(self) -> float:
         return (time.monotonic() - self._origin) * self._speed_up

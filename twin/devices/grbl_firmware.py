@@ -141,7 +141,7 @@ class GrblFirmware:
 
     def laser_power(self) -> float:
         """Return the duty cycle of the laser's pin."""
-        return self._spindle(self._now()) / self._settings[30]
+        return self._compute_spindle(self._now()) / self._settings[30]
 
     def hear(self, data: bytes) -> None:
         """Receive characters from the computer; they are lost during the start."""
@@ -271,7 +271,7 @@ class GrblFirmware:
         fields = [state, f"{'MPos' if machine else 'WPos'}:{x:.3f},0.000,0.000"]
         if int(self._settings[10]) & 2:
             fields.append(f"Bf:{_PLANNER_BLOCKS - self.axis.pending},{_RECEIVE_BYTES - len(self._input)}")
-        fields.append(f"FS:{abs(speed) * 60:.0f},{self._spindle(now):.0f}")
+        fields.append(f"FS:{abs(speed) * 60:.0f},{self._compute_spindle(now):.0f}")
         # Tolerance of half a step, so that rounding does not trigger the limit switch.
         stage_mm, slack = position + self.shift_mm, 0.5 / self._settings[100]
         if stage_mm < -slack if int(self._settings[23]) & 1 else stage_mm > self._settings[130] + slack:
@@ -282,7 +282,7 @@ class GrblFirmware:
         self._reports_to_offset -= 1
         return f"<{'|'.join(fields)}>"
 
-    def _spindle(self, now: float) -> float:
+    def _compute_spindle(self, now: float) -> float:
         """Return the effective S; laser mode switches off during G0 and holds, and scales M4 with the speed."""
         if self._modal["spindle"] == "M5" or self._mode == "Alarm":
             return 0.0

@@ -90,7 +90,7 @@ class Axis:
 
     def braking(self, time_s: float) -> bool:
         """Return whether the axis is decelerating for a hold."""
-        return self._brake is not None and self._clock(time_s) < self._brake.end_s
+        return self._brake is not None and self._read_clock(time_s) < self._brake.end_s
 
     def add(self, end_mm: float, *, speed: float, time_s: float) -> None:
         """Queue a block; it starts after the queued ones, and continues a movement of equal direction and speed."""
@@ -100,7 +100,7 @@ class Axis:
             return
         last = self._moves[-1] if self._moves else None
         if last and last.speed == speed and (end_mm - start_mm) * (start_mm - last.start_mm) > 0:
-            clock = max(self._clock(time_s), last.start_s)
+            clock = max(self._read_clock(time_s), last.start_s)
             at_mm, at_speed = last.state_at(clock)
             blocks = (*last.blocks, end_mm)
             self._moves[-1] = Ramp(at_mm, blocks, speed, self.acceleration, clock, abs(at_speed))
@@ -111,7 +111,7 @@ class Axis:
         """Remove finished blocks."""
         if self._brake:
             return
-        while self._moves and self._clock(time_s) >= self._moves[0].end_s:
+        while self._moves and self._read_clock(time_s) >= self._moves[0].end_s:
             self.rest_mm = self._moves.popleft().end_mm
         if self._moves and len(self._moves[0].blocks) > 1:
             move, (at_mm, _) = self._moves[0], self.state_at(time_s)
@@ -126,7 +126,7 @@ class Axis:
 
     def state_at(self, time_s: float) -> tuple[float, float]:
         """Return position and signed speed."""
-        clock = self._clock(time_s)
+        clock = self._read_clock(time_s)
         if self._brake:
             return self._brake.state_at(clock)
         for move in self._moves:
@@ -140,7 +140,7 @@ class Axis:
         if not self._brake:
             position, speed = self.state_at(time_s)
             end_mm, fast = position + speed * abs(speed) / (2 * self.acceleration), abs(speed)
-            self._brake = Ramp(position, (end_mm,), fast, self.acceleration, self._clock(time_s), fast)
+            self._brake = Ramp(position, (end_mm,), fast, self.acceleration, self._read_clock(time_s), fast)
 
     def resume(self, time_s: float) -> None:
         """Continue the remaining movements from rest."""
@@ -168,5 +168,5 @@ class Axis:
         self.rest_mm, self._brake, self._stuck_s = position_mm, None, None
         self._moves.clear()
 
-    def _clock(self, time_s: float) -> float:
+    def _read_clock(self, time_s: float) -> float:
         return time_s if self._stuck_s is None else min(time_s, self._stuck_s)

@@ -178,7 +178,7 @@ class Bench:
     def prepare(self, exposure_ms: float) -> None:
         """Compile the kernels for laser images with a trial image, because the compilation exceeds an exposure."""
         state = replace(self._state(), laser_on=True, power=1.0)
-        light = self._electrons_per_ms(state, None)
+        light = self._render_electrons_per_ms(state, None)
         self._simulator.detect(exposure_ms * light, exposure_ms=exposure_ms, noise_seed=[self._simulator.options.seed])
         self._travelled_mm, self.renderings = math.nan, 0
 
@@ -192,28 +192,28 @@ class Bench:
             velocity = state.speed_mm_per_s * self._track.motion.unit_direction()
             travel = self._simulator.travel_at(velocity, np.zeros(3), exposure_ms=exposure_ms)
             self._seen.clear()
-        light = exposure_ms * self._electrons_per_ms(state or self._state(), travel)
+        light = exposure_ms * self._render_electrons_per_ms(state or self._state(), travel)
         if travel is not None:
             self._seen.clear()
         noise_seed = [self._simulator.options.seed, _NOISE, self.frames]
         self.frames += 1
         return self._simulator.detect(light, exposure_ms=exposure_ms, noise_seed=noise_seed)
 
-    def _electrons_per_ms(self, state: StageState, travel: "Travel | None") -> np.ndarray:
+    def _render_electrons_per_ms(self, state: StageState, travel: "Travel | None") -> np.ndarray:
         """Return mean photo-electrons per ms (H, W), without noise; those of the latest position are kept."""
         travelled_mm = self._track.shot(state.position_mm, "laser").travelled_mm
         if travelled_mm != self._travelled_mm:
             self._travelled_mm, self._seen = travelled_mm, {}
         if state.power == 0:
-            return self._light("lamp" if self._lamp else "day", state, travel)
-        laser = self._light("laser", state, travel)
+            return self._look_up_light("lamp" if self._lamp else "day", state, travel)
+        laser = self._look_up_light("laser", state, travel)
         if state.power >= 1:
             return laser
         # A laser frame includes the daylight, which does not depend on the laser's power.
-        day = self._light("day", state, travel)
+        day = self._look_up_light("day", state, travel)
         return day + np.float32(state.power) * np.maximum(laser - day, 0)
 
-    def _light(self, light: Light, state: StageState, travel: "Travel | None") -> np.ndarray:
+    def _look_up_light(self, light: Light, state: StageState, travel: "Travel | None") -> np.ndarray:
         if light not in self._seen:
             shot, options = self._track.shot(state.position_mm, light), self._simulator.options
             # Position in whole um as a non-negative seed.

@@ -290,7 +290,7 @@ def _collect_pits(into: FlawFindings, scene: Scene, inspection: dict[str, Any]) 
         into.depths_mm.append(depths[pit])
         into.found.append(pit in known)
         if (feature := known.get(pit)) is not None and feature["reason"] is None:
-            into.values.append((*_value(feature["values"]["depth"]), depths[pit]))
+            into.values.append((*_state_value(feature["values"]["depth"]), depths[pit]))
 
 
 def _collect_undercuts(into: FlawFindings, scene: Scene, inspection: dict[str, Any]) -> None:
@@ -307,10 +307,10 @@ def _collect_undercuts(into: FlawFindings, scene: Scene, inspection: dict[str, A
         into.signals_mm.append(value["value"] if value is not None else 0.0)
         if value is not None:
             into.thresholds_mm.append(value["high"] - value["value"])
-            into.values.append((*_value(value), depth))
+            into.values.append((*_state_value(value), depth))
 
 
-def _value(value: dict[str, Any]) -> tuple[float, float]:
+def _state_value(value: dict[str, Any]) -> tuple[float, float]:
     """Return a value and its standard uncertainty."""
     return value["value"], math.hypot(value["random"], value["systematic"] or 0.0)
 

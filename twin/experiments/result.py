@@ -93,7 +93,7 @@ class ExperimentResult(Brief, BaseModel, frozen=True):
             *(f"understated: {each.text()}" for each in self.understated),
         ]
         if self.detections:
-            lines += align_columns([_DETECTION_HEAD, *map(_detection_row, self.detections)], right=range(2, 7))
+            lines += align_columns([_DETECTION_HEAD, *map(_make_detection_row, self.detections)], right=range(2, 7))
             lines += ["a90: depth found with 90 % probability; a90/95: its upper bound with 95 % confidence"]
         return [*lines, "valid for this sensor, and for imperfections as in the campaign, where it was checked:"] + [
             f"  {scan}: {text}" for scan, text in self.conditions.items()
@@ -101,14 +101,14 @@ class ExperimentResult(Brief, BaseModel, frozen=True):
 
     def errors(self) -> tuple[FigureErrors, ...]:
         """Return the errors of every figure of every scan; with several calibrations, those of each object together."""
-        return self.table.pooled_errors() if len(self._methods()) > 1 else self.table.errors()
+        return self.table.pooled_errors() if len(self._list_methods()) > 1 else self.table.errors()
 
-    def _methods(self) -> list[str]:
+    def _list_methods(self) -> list[str]:
         return list(dict.fromkeys(row.method for row in self.table.rows))
 
-    def _mean_values(self) -> list[tuple[str, ...]]:
+    def _list_mean_values(self) -> list[tuple[str, ...]]:
         """Return scan, or object with several calibrations, then calibration, figure and mean without a true value."""
-        pooled = len(self._methods()) > 1
+        pooled = len(self._list_methods()) > 1
         groups: dict[tuple[str, ...], list[float]] = {}
         for row in self.table.rows:
             if row.true_mm is None:
@@ -118,7 +118,7 @@ class ExperimentResult(Brief, BaseModel, frozen=True):
 
     def errors_figure(self) -> Figure:
         """Return a chart: bars for the stated uncertainties, and a dot for the error of every measurement."""
-        methods, groups = self._methods(), self.errors()
+        methods, groups = self._list_methods(), self.errors()
         places = [len(list(group)) for _, group in groupby(groups, lambda each: (each.scan, each.name))]
         figure, (axes,) = new_figure(8.0, 1.2 + 0.3 * len(groups))
         for place, each in enumerate(groups):
@@ -140,9 +140,9 @@ class ExperimentResult(Brief, BaseModel, frozen=True):
         ``clouds`` are files of clouds for the page, by name.
         """
         write_model(folder / RESULT, self, file_format="twin-experiment", version=1, overwrite=True)
-        write_page(folder / PAGE, self._page(clouds or {}), overwrite=True)
+        write_page(folder / PAGE, self._render(clouds or {}), overwrite=True)
 
-    def _page(self, clouds: Mapping[str, Path]) -> str:
+    def _render(self, clouds: Mapping[str, Path]) -> str:
         """Return a page with the uncertainties and errors, the probabilities of detection, and clouds."""
         count, collected, shown = len(self.seeds), FigureCollector(), []
         for name, path in clouds.items():
@@ -160,15 +160,15 @@ class ExperimentResult(Brief, BaseModel, frozen=True):
             published_head=_PUBLISHED_HEAD,
             published=[each.texts() for each in self.published],
             rows=[each.texts() for each in self.errors()],
-            values=self._mean_values(),
+            values=self._list_mean_values(),
             clouds=shown,
             curves=_draw_curves(self.detections) if self.detections else None,
             detection_head=_DETECTION_HEAD,
-            detections=[*map(_detection_row, self.detections)],
+            detections=[*map(_make_detection_row, self.detections)],
         )
 
 
-def _detection_row(each: ProbabilityOfDetection) -> tuple[str, ...]:
+def _make_detection_row(each: ProbabilityOfDetection) -> tuple[str, ...]:
     """Return the cells of a probability of detection."""
     depths = ("-" if depth is None else f"{depth:.3f}" for depth in (each.a90_mm, each.a90_95_mm))
     found = f"{sum(each.found)} of {len(each.found)}"

@@ -534,10 +534,10 @@ class EvenLight:
             scattered = self.scattering.coefficient * (1 if ambient else self.scattering.backward_share)
             radiance += opaque(scattered / self.scattering.extinction) * (1 - left)
         if self.uneven_lamp and not ambient:
-            radiance *= self._lamp_share(segment)
+            radiance *= self._compute_lamp_share(segment)
         return segment.weight * level * radiance
 
-    def _lamp_share(self, segment: RaySegment) -> Float:
+    def _compute_lamp_share(self, segment: RaySegment) -> Float:
         """Return the fraction of lamp light at the end of camera rays: a round Gaussian spot about the lamp's axis.
 
         The fraction ``uneven_lamp`` is lost at the corner slope's distance from that axis.

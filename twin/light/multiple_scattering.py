@@ -101,7 +101,7 @@ class IndirectLight:
         with the distance from the sheet over one of `SPREAD_MM`.
         """
         height, width = stripe.shape
-        cells, inside = self._smooth(stripe, haze, surfaces) if self._scatters else self._means()
+        cells, inside = self._smooth(stripe, haze, surfaces) if self._scatters else self._compute_means()
         size = self._shape[1] * WALK_CELL_PX, self._shape[0] * WALK_CELL_PX
         image = cv2.resize(cells.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)[:height, :width]
         for down, right in np.ndindex(NODE_SPACING_PX, NODE_SPACING_PX):
@@ -151,7 +151,7 @@ class IndirectLight:
             np.stack([np.ones_like(fine_haze), fine_haze, *(image[self._lit] for image in reflected), *fine_blurs]),
         )
 
-    def _means(self) -> tuple[np.ndarray, np.ndarray]:
+    def _compute_means(self) -> tuple[np.ndarray, np.ndarray]:
         """Return unsmoothed light in the same cells: without scattering there are no rare bright samples."""
         cells = np.sum([in_large.total() for in_large, _ in self._found], axis=0) / (self._walks * self._times)
         inside = np.sum([in_small.total()[0] for _, in_small in self._found], axis=0)
@@ -256,19 +256,19 @@ class FoundLight:
 
     def light(self, kinds: range) -> np.ndarray:
         """Return the light (rows, columns) of the walks in some classes."""
-        found = self._light[self._slice_of(kinds)]
+        found = self._light[self._find_slice(kinds)]
         return (found[0] if len(found) == 1 else found.sum(axis=0)).reshape(self.shape)
 
     def squares(self, kinds: range) -> float:
         """Return the sum of squared light of the walks in some classes."""
-        return float(self._squares[self._slice_of(kinds)].sum())
+        return float(self._squares[self._find_slice(kinds)].sum())
 
     def total(self) -> np.ndarray:
         """Return the light (rows, columns) of all walks."""
         self._sort()
         return self._light.sum(axis=0).reshape(self.shape)
 
-    def _slice_of(self, kinds: range) -> slice:
+    def _find_slice(self, kinds: range) -> slice:
         self._sort()
         return slice(max(kinds.start - self._first, 0), max(kinds.stop - self._first, 0))
 

@@ -156,8 +156,8 @@ class SpotSampler:
             # Bodies that are in the sheet at any time of the exposure.
             reach = reach + dr.abs(through) / (2 * _SIGMAS)
             start = middle.normal * (reach * to_jit(aside))
-            tracks = {"start": _image_shift(start, right, down, bundle.direction)}
-            tracks["moved"] = _image_shift(moved, right, down, bundle.direction)
+            tracks = {"start": _compute_image_shift(start, right, down, bundle.direction)}
+            tracks["moved"] = _compute_image_shift(moved, right, down, bundle.direction)
             tracks = {f"{name}_{axis}": values[k] for name, values in tracks.items() for k, axis in enumerate("xy")}
             tracks |= {"through": through, "reach": reach, "sigma": middle.sigma_mm}
         place = mi.Point3f(points[0] + middle.normal * (reach * to_jit(aside)))
@@ -176,7 +176,7 @@ class SpotSampler:
         return {name: value.numpy().astype(float) for name, value in values.items()}
 
 
-def _image_shift(way: Vector3f, right: Vector3f, down: Vector3f, ray: Vector3f) -> tuple[Float, Float]:
+def _compute_image_shift(way: Vector3f, right: Vector3f, down: Vector3f, ray: Vector3f) -> tuple[Float, Float]:
     """Return the shift in px, along x and y, of the image of points that move by ``way``, to first order.
 
     ``right`` and ``down`` are the ways in the sheet that shift the image by a pixel; ``ray`` is the camera ray.

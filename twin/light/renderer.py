@@ -170,10 +170,10 @@ class SurfaceLight:
             if planes is not None and index == 0:
                 alone = len(sources) == len(sources[0].sheet.parts) == 1
                 plane = dr.gather(mi.Vector4f, planes, pixel)
-                of_line = self._line_sums(segment, after_s, sources[0], value if alone else main, plane)
+                of_line = self._sample_lines(segment, after_s, sources[0], value if alone else main, plane)
         return total, polarised, rough, *of_line
 
-    def _line_sums(
+    def _sample_lines(
         self, segment: RaySegment, after_s: Float | None, light: Light, value: Float, plane: Vector4f
     ) -> tuple[Float, Float, Float]:
         """Return samples for `render_line_light`; ``value`` is the light of the main part of ``light``."""
@@ -217,14 +217,14 @@ class StripeLocator:
         if last is None or not pose.equals(last.pose) or (with_nodes and last.nodes is None):
             begin_kernels()
             lights = make_lights(self.sheets, pose, self.mirrors)
-            last = self._last = _LocatedStripes(pose, *self._laser_nodes(pose, *lights))
+            last = self._last = _LocatedStripes(pose, *self._find_laser_nodes(pose, *lights))
         return last
 
     def lit_pixels(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray]:
         """Return rows and columns of pixels, among them all whose chief rays meet the stripe of the first laser."""
         return find_marked(expand_cells(self.locate(pose).bright, *self._size))
 
-    def _laser_nodes(
+    def _find_laser_nodes(
         self, pose: SensorPose, direct: list[Light], mirrored: list[Light]
     ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, list[np.ndarray]]]:
         """Return the masks of bright and lit cells (rows, columns) as in `_LocatedStripes`, haze and lit surfaces."""
@@ -234,7 +234,7 @@ class StripeLocator:
         image = np.zeros(self._size, np.float32)
         surfaces: list[Float] = []
         scatters = self.surfaces.scattering.coefficient > 0 and (self.effects.haze or self.effects.multiple_scattering)
-        for moment, sources in self._moments(pose, direct + mirrored):
+        for moment, sources in self._list_moments(pose, direct + mirrored):
             scattered = mi.Float(0.0)
             for index, segment in enumerate(self.surfaces.segments(moment, bundle, None)):
                 ends = [light.evaluate(segment.end()) for light in sources]
@@ -248,7 +248,7 @@ class StripeLocator:
                     if self.effects.multiple_scattering:
                         surfaces = self.surfaces.lit_near_sheets(pose, segment, ends)
                     for light, here in zip(sources, ends, strict=True):
-                        crossed = self._crossing(light, bundle)
+                        crossed = self._intersect_sheet(light, bundle)
                         scattered += compute_haze(crossed, light, self.surfaces.objects.scene, segment, here)
                 reached = [light.may_reach(segment.end(), here) for light, here in zip(sources, ends, strict=True)]
                 dr.eval(depth, scattered, surfaces, *across, *reached)
@@ -266,7 +266,7 @@ class StripeLocator:
         bright, lit = (dilate_cells(each, reach) for each in (bright, lit))
         return bright, lit, (image, [each.numpy().reshape(shape) for each in surfaces])
 
-    def _moments(self, pose: SensorPose, sources: list[Light]) -> Iterator[tuple[SensorPose, list[Light]]]:
+    def _list_moments(self, pose: SensorPose, sources: list[Light]) -> Iterator[tuple[SensorPose, list[Light]]]:
         """Yield the pose and its lights, and further poses during the exposure if the sensor moves."""
         yield pose, sources
         if pose.travel is not None:
@@ -278,7 +278,7 @@ class StripeLocator:
                 direct, mirrored = make_lights(self.sheets, moved, self.mirrors)
                 yield moved, direct + mirrored
 
-    def _crossing(self, light: Light, bundle: Rays) -> SheetCrossing:
+    def _intersect_sheet(self, light: Light, bundle: Rays) -> SheetCrossing:
         """Return the intersections of the nodes' rays with a sheet, cached for direct lights."""
         if light.mirror is not None:
             return intersect_sheet(light, self.surfaces.scattering, bundle)

@@ -132,7 +132,7 @@ class Sheet:
             m -= (self._y0(t) + m * p.z - p.y) / (self._dy0(t) + p.z)
             m = dr.clip(m, self._least, self._most)
         t = self._normalise(m)
-        tilt, normal = self._tilt(t), self._normal(m, t, p.z)
+        tilt, normal = self._tilt(t), self._compute_normal(m, t, p.z)
         distance = (p.x - self._x0(t) - tilt * p.z) * normal.x
         stretch = dr.sqrt(1 + m * m + tilt * tilt)
         exit_mm = (p.z - self._exit_z(t)) * stretch
@@ -168,8 +168,8 @@ class Sheet:
         ahead = dr.dot(from_laser, along) / stretch
         to_waist = dr.safe_sqrt(ahead * ahead - dr.squared_norm(from_laser) + dr.square(self._waist_at)) - ahead
         waist_z = z + to_waist / stretch
-        sigma = 0.5 * self._waist / self._normal(m, t, waist_z).x
-        beside, turned = sigma * _standard_normal(u.y), sigma / self._rayleigh * _standard_normal(u.z)
+        sigma = 0.5 * self._waist / self._compute_normal(m, t, waist_z).x
+        beside, turned = sigma * _draw_normal(u.y), sigma / self._rayleigh * _draw_normal(u.z)
         leaves.x += beside - turned * to_waist
         along.x += turned * stretch
         return leaves, dr.normalize(along)
@@ -177,7 +177,7 @@ class Sheet:
     def _normalise(self, m: Float) -> Float:
         return dr.fma(m, self._scale, self._offset)
 
-    def _normal(self, m: Float, t: Float, z: Float) -> Vector3f:
+    def _compute_normal(self, m: Float, t: Float, z: Float) -> Vector3f:
         """Return the unit normal of the surface X(Y, Z), from X_Y = (x0' + k' Z) / (y0' + Z) and X_Z = k - m X_Y."""
         # Both derivatives vanish at the fan's vertex.
         spread = dr.maximum(self._dy0(t) + z, _SMALLEST_SPREAD_MM)
@@ -195,7 +195,7 @@ def _trace_fan(sensor: Sensor, medium: Medium) -> tuple[np.ndarray, np.ndarray, 
     )
     # Chebyshev nodes, denser towards the edges, prevent oscillation of the series.
     angle = -math.radians(laser.fan_angle_deg / 2) * np.cos(np.linspace(0, math.pi, _RAYS))
-    fan = mi.Vector3f(rotation @ _fan_directions(laser, angle))
+    fan = mi.Vector3f(rotation @ _compute_fan_directions(laser, angle))
     path = faces.trace(mi.Point3f(pose.origin_mm), fan, mode=mi.TransportMode.Importance)
     if not bool(dr.all(path.weight > 0)):
         raise DesignError(
@@ -210,13 +210,13 @@ def _trace_fan(sensor: Sensor, medium: Medium) -> tuple[np.ndarray, np.ndarray, 
 
 def _tabulate_power(laser: Laser, slope: np.ndarray, angle: np.ndarray, passed: np.ndarray) -> tuple[PowerTable, float]:
     """Return the power behind the window per slope, and the total power in W, from fan rays (N,)."""
-    lit = _fan_lit_angles(laser)
+    lit = _find_lit_angles(laser)
     first, last = np.interp(lit[[0, -1]], angle, slope)
     nodes = np.linspace(first, last, _NODES)
     angle_of, passes = _fit_series(slope, angle, _SERIES_SLOPE), _fit_series(slope, passed, 1e-6)
-    density = _power_per_angle(laser, np.clip(angle_of(nodes), lit[0], lit[-1])) * passes(nodes)
+    density = _compute_power_per_angle(laser, np.clip(angle_of(nodes), lit[0], lit[-1])) * passes(nodes)
     between = np.union1d(lit, angle[(angle > lit[0]) & (angle < lit[-1])])
-    total = float(np.trapezoid(_power_per_angle(laser, between) * np.interp(between, angle, passed), between))
+    total = float(np.trapezoid(_compute_power_per_angle(laser, between) * np.interp(between, angle, passed), between))
     return PowerTable(nodes, density * angle_of.deriv()(nodes), power_w=total), total
 
 
@@ -241,18 +241,18 @@ class _Series:
         return dr.fma(t, ahead, self._coefficients[0] - beyond)
 
 
-def _standard_normal(u: Float) -> Float:
+def _draw_normal(u: Float) -> Float:
     return math.sqrt(2.0) * dr.erfinv(dr.clip(2 * u - 1, -1 + 1e-7, 1 - 1e-7))
 
 
-def _fan_lit_angles(laser: Laser) -> np.ndarray:
+def _find_lit_angles(laser: Laser) -> np.ndarray:
     """Return the angles (K,) in rad that bound the smooth parts of the power per angle, which is 0 outside them."""
     half = laser.fan_angle_deg / 2
     table = laser.fan_table()
     return np.radians([angle for angle, _ in table] if table else (-half, half))
 
 
-def _fan_directions(laser: Laser, angle: np.ndarray) -> np.ndarray:
+def _compute_fan_directions(laser: Laser, angle: np.ndarray) -> np.ndarray:
     """Return unit directions (3, N) of fan rays in the laser's frame.
 
     A beam tilted by alpha against the line optics leaves them as a cone. Its distance from a plane sheet is z
@@ -263,7 +263,7 @@ def _fan_directions(laser: Laser, angle: np.ndarray) -> np.ndarray:
     return along / np.linalg.norm(along, axis=0)
 
 
-def _power_per_angle(laser: Laser, angle: np.ndarray) -> np.ndarray:
+def _compute_power_per_angle(laser: Laser, angle: np.ndarray) -> np.ndarray:
     """Return the power in W/rad at lit angles (N,), before the window; its integral is the laser's power."""
     half = math.radians(laser.fan_angle_deg / 2)
     match laser.fan_profile:
@@ -272,7 +272,7 @@ def _power_per_angle(laser: Laser, angle: np.ndarray) -> np.ndarray:
         case "gaussian":
             relative, total = np.exp(-2 * (angle / half) ** 2), half * math.sqrt(math.pi / 2) * math.erf(math.sqrt(2))
         case "powell" | tuple():
-            nodes, powers = _fan_lit_angles(laser), [power for _, power in laser.fan_table()]
+            nodes, powers = _find_lit_angles(laser), [power for _, power in laser.fan_table()]
             relative, total = np.interp(angle, nodes, powers), np.trapezoid(powers, nodes)
         case _:
             assert_never(laser.fan_profile)
@@ -298,7 +298,7 @@ class PowerTable:
         place = (x - self._low) / self._step
         # The second bound catches NaN, which clipping does not.
         cell = dr.minimum(mi.UInt32(dr.clip(place, 0.0, self._cells - 1.0)), self._cells - 1)
-        share = dr.lerp(*self._ends(cell), place - mi.Float(cell))
+        share = dr.lerp(*self._gather_ends(cell), place - mi.Float(cell))
         return dr.select((place >= 0) & (place <= self._cells), self._power_per_step * share, 0.0)
 
     def draw(self, u: Float) -> Float:
@@ -308,11 +308,11 @@ class PowerTable:
         """
         cell = dr.binary_search(0, self._cells - 1, lambda i: dr.gather(mi.Float, self._below, i + 1) <= u)
         rest = u - dr.gather(mi.Float, self._below, cell)
-        a, b = self._ends(cell)
+        a, b = self._gather_ends(cell)
         t = 2 * rest / dr.maximum(a + dr.safe_sqrt(a * a + 2 * (b - a) * rest), 1e-30)
         return self._low + self._step * (mi.Float(cell) + dr.clip(t, 0.0, 1.0))
 
-    def _ends(self, cell: UInt32) -> tuple[Float, Float]:
+    def _gather_ends(self, cell: UInt32) -> tuple[Float, Float]:
         return dr.gather(mi.Float, self._share, cell), dr.gather(mi.Float, self._share, cell + 1)
 
 

@@ -178,7 +178,7 @@ class Walker:
         for light, passage in zip(self.lights, passages, strict=False):
             from_sheet += self._scatter_from_sheet(light, passage, o, d, walks.diffuse, rng.next_float32())
         for light in self.lights:
-            from_surfaces += dr.exp(-c * length) * self._lit_end(light, walks, si, bsdf, end, hit)
+            from_surfaces += dr.exp(-c * length) * self._add_lit_end(light, walks, si, bsdf, end, hit)
 
         # The walk is scattered or reaches the surface, and survives Russian roulette.
         in_water, distance, passed = _sample_free_path(self.scattering, passages, length, hit, self.reach_mm, rng)
@@ -279,7 +279,7 @@ class Walker:
         value = self.scattering.b * source * dr.exp(-self.scattering.c * t) / density
         return dr.select(lit, value, 0.0)
 
-    def _lit_end(
+    def _add_lit_end(
         self, light: Light, walks: _Walks, si: SurfaceInteraction3f, bsdf: BSDFPtr, end: Point3f, hit: Bool
     ) -> Float:
         """Return the radiance of the lit surface at the segment's end, with its balance-heuristic weight."""
@@ -292,7 +292,7 @@ class Walker:
         radiance = bsdf.eval(mi.BSDFContext(), si, towards, active)[0] * here.irradiance
         # Both densities are per sr: per mm2, the density of a walk along its own surface is unbounded.
         by_walk = walks.density * dr.abs(mi.Frame3f.cos_theta(si.wi))
-        by_light = _light_density(self.scattering.c, light, here, mi.Frame3f.cos_theta(towards)) * dr.square(si.t)
+        by_light = _find_light_density(self.scattering.c, light, here, mi.Frame3f.cos_theta(towards)) * dr.square(si.t)
         return dr.select(active & (by_walk > 0), radiance * by_walk / (by_walk + by_light), 0.0)
 
     def _connect(self, light: Light, vertex: Point3f, scattered, u: Point3f, active: Bool) -> Float:
@@ -316,14 +316,14 @@ class Walker:
         active &= (sent * value > 0) & (distance > 2 * CLEAR_MM)
         active &= ~self.objects.scene.ray_test(shadow, active)
         here = light.evaluate(lit)
-        by_light = _light_density(self.scattering.c, light, here, mi.Frame3f.cos_theta(si.wi))
+        by_light = _find_light_density(self.scattering.c, light, here, mi.Frame3f.cos_theta(si.wi))
         by_walk = density * dr.abs(mi.Frame3f.cos_theta(local)) / dr.square(distance)
         way = here.exit_mm + distance
         light_there = light.power_w * sent * dr.exp(-self.scattering.c * way) / dr.square(distance)
         return dr.select(active & (by_light > 0), value * light_there * by_light / (by_light + by_walk), 0.0)
 
 
-def _light_density(extinction: Float, light: Light, here: SheetLight, cosine: Float) -> Float:
+def _find_light_density(extinction: Float, light: Light, here: SheetLight, cosine: Float) -> Float:
     """Return the density per mm2 of the lit points sampled by `Walker._connect`: the fraction of power per area."""
     return here.irradiance * dr.exp(extinction * here.exit_mm) * dr.abs(cosine) / light.power_w
 

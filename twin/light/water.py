@@ -147,14 +147,14 @@ class AngleTable:
     def density(self, one_minus_cosine: Float) -> Float:
         """Return the density in 1/sr at 1 - cos of the angle from the axis; it does not depend on azimuth."""
         before = dr.clip(one_minus_cosine, FORWARD_END, 2 - BACKWARD_END)
-        cell, share = self._cell(before)
-        low, high = self._ends(cell)
+        cell, share = self._find_cell(before)
+        low, high = self._gather_ends(cell)
         density = dr.exp(dr.fma(high - low, share, low)) / (math.pi * before * (2 - before))
         return dr.select(one_minus_cosine < FORWARD_END, self.forward, density)
 
     def share_below(self, one_minus_cosine: Float) -> Float:
         """Return the cumulative fraction of directions at the table's node at or below 1 - cos of an angle."""
-        return self._share(self._cell(dr.maximum(one_minus_cosine, FORWARD_END))[0])
+        return self._share(self._find_cell(dr.maximum(one_minus_cosine, FORWARD_END))[0])
 
     def heights(self, u: Float) -> tuple[Float, Float]:
         """Return 1 - cos and 1 + cos of the angle below which the fraction ``u`` of directions is scattered."""
@@ -166,7 +166,7 @@ class AngleTable:
         cell = dr.minimum(node, NODES - 2)
         below, above = self._share(cell), self._share(cell + 1)
         share = dr.clip((u - below) / (above - below), 0.0, 1.0)
-        low, high = self._ends(cell)
+        low, high = self._gather_ends(cell)
         # The density exp(k t), 0 < t < 1, has the inverse log(1 + share (exp(k) - 1)) / k, undefined at k = 0. This is
         # its expansion to third order in k, which is below 0.05.
         k = high - low
@@ -180,13 +180,13 @@ class AngleTable:
         after = dr.select(backward, BACKWARD_END * (1 - u) / (1 - last), after)
         return dr.select(backward, 2 - after, before), dr.select(forward, 2 - before, after)
 
-    def _cell(self, before: Float) -> tuple[UInt32, Float]:
+    def _find_cell(self, before: Float) -> tuple[UInt32, Float]:
         """Return the cell of 1 - cos, which is within the table, and the position in the cell from 0 to 1."""
         place = (dr.log(before / (2 - before)) - FIRST_PLACE) / STEP
         cell = dr.minimum(mi.UInt32(dr.maximum(place, 0.0)), NODES - 2)
         return cell, place - mi.Float(cell)
 
-    def _ends(self, cell: UInt32) -> tuple[Float, Float]:
+    def _gather_ends(self, cell: UInt32) -> tuple[Float, Float]:
         """Return the logarithm of the density at both ends of a cell."""
         place = self.start + cell
         return dr.gather(mi.Float, self.log_density, place), dr.gather(mi.Float, self.log_density, place + 1)

@@ -93,7 +93,7 @@ def record(
     require_at_least(0, seed=seed)
     described, folder = load_campaign(campaign), Path(out)
     flaws = Flaws.parse(*effects)
-    jobs = _jobs(described, folder, options, seed=seed, flaws=flaws)
+    jobs = _list_jobs(described, folder, options, seed=seed, flaws=flaws)
     plan = _plan(described, options) | {"seed": seed, "effects": flaws.names()}
     _record_all(jobs, folder, plan, options, recorded="*.h5*", progress=progress)
     return folder
@@ -146,13 +146,13 @@ def record_campaigns(
     jobs = [
         job
         for seed, place in zip(seeds, folders, strict=True)
-        for job in _jobs(campaign, place, options, seed=seed, flaws=Flaws())
+        for job in _list_jobs(campaign, place, options, seed=seed, flaws=Flaws())
     ]
     _record_all(jobs, folder, _plan(campaign, options), options, recorded="campaign-*/*.h5*", progress=progress)
     return folders
 
 
-def _jobs(campaign: Campaign, place: Path, options: RecordingOptions, *, seed: int, flaws: Flaws) -> list[_Job]:
+def _list_jobs(campaign: Campaign, place: Path, options: RecordingOptions, *, seed: int, flaws: Flaws) -> list[_Job]:
     return [
         _Job(take, place / f"{take.name}.h5", Options(spp=options.spp, seed=take.seed, flaws=flaws), options.variant)
         for take in list_takes(campaign, seed=seed, every=options.every)

@@ -108,7 +108,7 @@ def measure_line_light(
 
     total, other, profile = values
     light = sum_lines(total)
-    slope = np.abs(_distance_slopes(renderer, pose, truth, lines))
+    slope = np.abs(_compute_distance_slopes(renderer, pose, truth, lines))
     with np.errstate(divide="ignore", invalid="ignore"):
         measured = {
             "centroid_px": centre + sum_lines((offset + middle[column] - centre[column]) * total) / light,
@@ -137,7 +137,7 @@ def mark_run(light: np.ndarray, centre: np.ndarray, share: float) -> np.ndarray:
     return (place > before) & (place < behind)
 
 
-def _distance_slopes(renderer: Renderer, pose: SensorPose, truth: FrameTruth, lines: np.ndarray) -> np.ndarray:
+def _compute_distance_slopes(renderer: Renderer, pose: SensorPose, truth: FrameTruth, lines: np.ndarray) -> np.ndarray:
     """Return the derivative of the sheet's distance on the lines' tangent planes across the stripe, in mm/px."""
     camera, distance = renderer.sensor.camera, []
     point, normal = (mi.Vector3f(*(to_jit(axis) for axis in v[lines].T)) for v in (truth.point_mm, truth.normal))

@@ -148,11 +148,11 @@ class SensorSimulator:
         if options.effects.fixed_pattern:
             self._pattern = fixed_pattern(self.sensor.detector, height=camera.height_px, width=camera.width_px)
         self._level_e = self.sensor.exposure.auto_level * self.sensor.detector.full_well_e
-        self.exposure_ms = {light: self._exposure(light, probe) for light in dict.fromkeys(scene.motion.lights)}
+        self.exposure_ms = {light: self._find_exposure(light, probe) for light in dict.fromkeys(scene.motion.lights)}
         longest_ms = max(self.exposure_ms[shot.light] * shot.exposure for shot in scene.motion.shots())
-        self.period_s = self._period_s(max(1e-3 * longest_ms, 1 / self.sensor.detector.frame_rate_hz))
+        self.period_s = self._compute_period_s(max(1e-3 * longest_ms, 1 / self.sensor.detector.frame_rate_hz))
 
-    def _period_s(self, shortest_s: float) -> float:
+    def _compute_period_s(self, shortest_s: float) -> float:
         """Return the time between shots: motion or settling of the platform, exposure and read-out of the camera.
 
         DesignError if a moving platform leaves the camera less time than it needs.
@@ -188,12 +188,12 @@ class SensorSimulator:
         motion, current = self.scene.motion, in_water * np.array(self.scene.current_mm_per_s)
         if not self.options.effects.motion or not (motion.moves() or current.any()):
             return None
-        exposure_ms, velocity, turn = self._exposure_of(shot), np.zeros(3), np.zeros(3)
+        exposure_ms, velocity, turn = self._choose_exposure(shot), np.zeros(3), np.zeros(3)
         if motion.moves():
             velocity, turn = motion.twist(shot, exposure_s=1e-3 * exposure_ms)
         return self.travel_at(velocity - current, turn, exposure_ms=exposure_ms)
 
-    def _exposure_of(self, shot: Shot) -> float:
+    def _choose_exposure(self, shot: Shot) -> float:
         """Return the exposure time of a shot in ms."""
         return self.exposure_ms[shot.light] * shot.exposure
 
@@ -284,7 +284,7 @@ class SensorSimulator:
             travel=self.travel(shot),
             through_water=self.travel(shot, in_water=True),
             time_s=self._time_s(shot, index),
-            exposure_s=1e-3 * self._exposure_of(shot),
+            exposure_s=1e-3 * self._choose_exposure(shot),
             with_truth=True,
         )
 
@@ -317,7 +317,7 @@ class SensorSimulator:
             seen,
             stage_mm=shot.stage_mm,
             laser_on=shot.light == "laser",
-            exposure_ms=self._exposure_of(shot),
+            exposure_ms=self._choose_exposure(shot),
             time_s=self._time_s(shot, index),
             pose=pose,
             pose_covariance=covariance,
@@ -329,7 +329,7 @@ class SensorSimulator:
         return self._render_image(self.light(shot, index), shot, index)
 
     def _render_image(self, light: ShotLight, shot: Shot, index: int) -> np.ndarray:
-        exposure_ms = self._exposure_of(shot)
+        exposure_ms = self._choose_exposure(shot)
         electrons = exposure_ms * self._electrons_per_ms(*light, shot)
         return self.detect(electrons, exposure_ms=exposure_ms, noise_seed=[self.options.seed, index])
 
@@ -339,7 +339,7 @@ class SensorSimulator:
         An automatic exposure is shortened until at most ``bright_share`` (if not 0) of pixels exceed ``auto_level``.
         """
         even, laser = self.light(shot, index)
-        per_ms, exposure_ms = self._electrons_per_ms(even, laser, shot), exposure * self._exposure_of(shot)
+        per_ms, exposure_ms = self._electrons_per_ms(even, laser, shot), exposure * self._choose_exposure(shot)
         if bright_share > 0 and self.sensor.exposure.described_ms(shot.light) == "auto":
             exposure_ms = min(exposure_ms, self._level_e / max(float(np.quantile(per_ms, 1 - bright_share)), 1e-9))
         nothing = np.zeros_like(even)
@@ -397,10 +397,10 @@ class SensorSimulator:
         for plate, pose in zip(self.scene.objects, self.scene.object_poses(), strict=True):
             if isinstance(plate, PrintedPlate) and plate.detection_std_px > 0:
                 seen = camera_from_object(self.sensor) @ np.linalg.inv(self.pose(shot)) @ pose
-                mm_per_px = self._apparent_depth_mm(seen[2, 3]) / self.sensor.camera.focal_length_px()
+                mm_per_px = self._compute_apparent_depth_mm(seen[2, 3]) / self.sensor.camera.focal_length_px()
                 shift_points(self.renderer.objects.scene, plate, mm_per_px=mm_per_px, image=index)
 
-    def _apparent_depth_mm(self, depth_mm: float) -> float:
+    def _compute_apparent_depth_mm(self, depth_mm: float) -> float:
         """Return the apparent depth of a point on the axis: a layer of index n appears n times thinner."""
         window, wavelength = self.sensor.camera.window, self.sensor.laser.wavelength_nm
         if not window.mounted:
@@ -409,7 +409,7 @@ class SensorSimulator:
         in_medium = outside / self.medium.refractive_index(wavelength)
         return window.distance_mm + window.thickness_mm / window.index(wavelength) + in_medium
 
-    def _exposure(self, light: Light, probe: Literal["scan", "middle"]) -> float:
+    def _find_exposure(self, light: Light, probe: Literal["scan", "middle"]) -> float:
         """Return the described exposure in ms, or that which brings the brightest shot to the wanted level."""
         wanted = self.sensor.exposure.described_ms(light)
         if wanted != "auto":

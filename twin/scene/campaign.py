@@ -257,7 +257,7 @@ class _SampledImperfections:
             angles = size.stage_misalignment_std_deg * rng.standard_normal(2)
         return _change_motion(
             scene,
-            direction=_tilt_direction(motion.unit_direction(), angles),
+            direction=_rotate_direction(motion.unit_direction(), angles),
             nominal_direction=motion.recorded_direction(),
             position_errors_mm=tuple(errors.tolist()),
         )
@@ -286,7 +286,7 @@ def _find_lower_block(scene: Scene) -> int:
     return max(blocks, key=lambda number: blocks[number])
 
 
-def _tilt_direction(direction: np.ndarray, angles_deg: np.ndarray) -> tuple[float, float, float]:
+def _rotate_direction(direction: np.ndarray, angles_deg: np.ndarray) -> tuple[float, float, float]:
     """Return a unit direction (3,) rotated by two small angles about two axes perpendicular to it."""
     least = np.eye(3)[np.argmin(np.abs(direction))]
     first = np.cross(direction, least)

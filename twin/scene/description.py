@@ -209,7 +209,7 @@ AnyObject = Annotated[
 ]
 
 
-def _kind_of_motion(motion: object) -> str:
+def _read_kind_of_motion(motion: object) -> str:
     return str(motion.get("kind", "") if isinstance(motion, Mapping) else getattr(motion, "kind", ""))
 
 
@@ -219,7 +219,7 @@ AnyMotion = Annotated[
     | Annotated[RotaryTable, Tag("rotary_table")]
     | Annotated[Robot, Tag("robot")]
     | Annotated[Vehicle, Tag("vehicle")],
-    Discriminator(_kind_of_motion),
+    Discriminator(_read_kind_of_motion),
 ]
 """The steps of a stage, or a platform selected by ``kind``."""
 
@@ -330,13 +330,13 @@ def value_at(described: Description, path: str, source: str | Path, *, called: s
             found = found[int(key)]
             continue
         if not isinstance(found, dict) or key not in found:
-            there = f"but {_places(found)}" if isinstance(found, dict | list | tuple) else "and nothing below"
+            there = f"but {_describe_places(found)}" if isinstance(found, dict | list | tuple) else "and nothing below"
             missing = f"the {called}'s description has no '{path}': there is no '{key}', {there}"
             raise DescriptionError(f"{source}: {missing}")
         found = found[key]
     if isinstance(found, dict | list | tuple):
         kind = "table" if isinstance(found, dict) else "list"
-        raise DescriptionError(f"{source}: '{path}' is a {kind}; name one of its values: {_places(found)}")
+        raise DescriptionError(f"{source}: '{path}' is a {kind}; name one of its values: {_describe_places(found)}")
     return cast("Value | None", found)
 
 
@@ -347,19 +347,19 @@ def with_values(table: dict[str, Any], changes: Mapping[str, Value]) -> dict[str
         *parents, last = path.split(".")
         place: Any = changed
         for parent in parents:
-            key = _key(place, parent)
+            key = _read_key(place, parent)
             below = place[key] if isinstance(place, list) else place.get(key, {})
             place[key] = below = list(below) if isinstance(below, list | tuple) else dict(below)
             place = below
-        place[_key(place, last)] = value
+        place[_read_key(place, last)] = value
     return changed
 
 
-def _key(place: Any, text: str) -> Any:
+def _read_key(place: Any, text: str) -> Any:
     return int(text) if isinstance(place, list) else text
 
 
-def _places(found: object) -> str:
+def _describe_places(found: object) -> str:
     if isinstance(found, dict):
         return ", ".join(map(str, found))
     return f"0 to {len(found) - 1}" if isinstance(found, list | tuple) and found else "nothing"

@@ -91,14 +91,14 @@ def finish_bsdf(
     missing, unreadable, or has values outside 0 to 1; RangeError if the wavelength is outside the table of iron.
     """
     finish, scale = thing.finish_properties(), 1.0
-    field = _random_field(finish, np.eye(4) if pose is None else pose, seed)
+    field = _make_random_field(finish, np.eye(4) if pose is None else pose, seed)
     if gloss and finish.reflection != "diffuse":
-        reflectance = _reflectance(thing, scale, field)
+        reflectance = _make_reflectance(thing, scale, field)
         return _make_glossy(thing, reflectance, medium_index=medium_index, wavelength_nm=wavelength_nm)
     if finish.reflection == "metal":
         index = iron_index(wavelength_nm=wavelength_nm) / medium_index
         scale = abs((index - 1) / (index + 1)) ** 2
-    return mi.load_dict({"type": "diffuse", "reflectance": _reflectance(thing, scale, field)})
+    return mi.load_dict({"type": "diffuse", "reflectance": _make_reflectance(thing, scale, field)})
 
 
 def _make_glossy(
@@ -115,7 +115,7 @@ def _make_glossy(
     return mi.load_dict(coat | rough | {"nonlinear": False, "diffuse_reflectance": reflectance})
 
 
-def _random_field(finish: FinishProperties, pose: np.ndarray, seed: Sequence[int]) -> dict[str, object]:
+def _make_random_field(finish: FinishProperties, pose: np.ndarray, seed: Sequence[int]) -> dict[str, object]:
     """Return the waves of mottle and patches in the scene, and the level of the patches; empty if there are none."""
     field: dict[str, object] = {}
     if finish.mottle > 0 and finish.reflectance > 0:
@@ -129,7 +129,7 @@ def _random_field(finish: FinishProperties, pose: np.ndarray, seed: Sequence[int
     return field
 
 
-def _reflectance(thing: SceneObject, scale: float, field: dict[str, object]) -> float | mi.Texture:
+def _make_reflectance(thing: SceneObject, scale: float, field: dict[str, object]) -> float | mi.Texture:
     """Return the reflectance of an object, a number or a texture, multiplied by ``scale``.
 
     ``field`` describes its random variation in the scene.
@@ -267,8 +267,8 @@ def register_textures() -> None:
             corner, beside = target.points_at(np.array([(0, 0), (1, 1)]))[:, :2]
             self.corner_point, self.spacing = corner.tolist(), (beside - corner).tolist()
             self.shift_mm = to_jit(draw_print_errors(plate).ravel())
-            patches = _patch_table(plate, scale)
-            lists, self.cell_mm = _patches_by_cell(patches, first, last)
+            patches = _draw_patches(plate, scale)
+            lists, self.cell_mm = _list_patches_by_cell(patches, first, last)
             self.rows, self.columns, self.depth = lists.shape
             self.patches = to_jit(patches[lists])
 
@@ -355,7 +355,7 @@ def _sum_waves(waves: Float, p: Point3f, active: Bool) -> Float:
     return total
 
 
-def _patch_table(plate: PrintedPlate, scale: float) -> np.ndarray:
+def _draw_patches(plate: PrintedPlate, scale: float) -> np.ndarray:
     """Return centre, half width, aspect ratio, roundness and reflectance (N + 1, 8) of patches.
 
     Reflectances are multiplied by ``scale``. The last row is a patch that is never hit.
@@ -373,7 +373,7 @@ def _patch_table(plate: PrintedPlate, scale: float) -> np.ndarray:
     return table
 
 
-def _patches_by_cell(patches: np.ndarray, first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, float]:
+def _list_patches_by_cell(patches: np.ndarray, first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, float]:
     """Return indices (rows, columns, depth) of the patches that overlap each grid cell, and the cell size in mm.
 
     They are in printing order; lists are padded with the patch that is never hit.
@@ -396,7 +396,7 @@ def _patches_by_cell(patches: np.ndarray, first: np.ndarray, last: np.ndarray) -
 
 def draw_print_errors(plate: PrintedPlate) -> np.ndarray:
     """Return the print errors (rows, columns, 2) in mm of a target's points along x and y."""
-    drawn, target = _standard_normal(plate, 0), plate.described_target()
+    drawn, target = _draw_normal(plate, 0), plate.described_target()
     rows, columns = np.indices(drawn.shape[:2])
     places = target.points_at(np.column_stack([columns.ravel(), rows.ravel()]))[:, :2].reshape(drawn.shape)
     return plate.centre_std_mm * drawn + np.array(plate.stretch) * places
@@ -404,14 +404,14 @@ def draw_print_errors(plate: PrintedPlate) -> np.ndarray:
 
 def shift_points(scene: mi.Scene, plate: PrintedPlate, *, mm_per_px: float, image: int) -> None:
     """Shift the points of a scene's only target by their print errors and their detection errors in one image."""
-    noise = mm_per_px * plate.detection_std_px * _standard_normal(plate, 1, image)
+    noise = mm_per_px * plate.detection_std_px * _draw_normal(plate, 1, image)
     parameters = mi.traverse(scene)
     (key,) = (key for key in dict(parameters) if key.endswith(_SHIFT))
     parameters[key] = to_jit((draw_print_errors(plate) + noise).ravel())
     parameters.update()
 
 
-def _standard_normal(plate: PrintedPlate, *stream: int) -> np.ndarray:
+def _draw_normal(plate: PrintedPlate, *stream: int) -> np.ndarray:
     """Return random numbers (rows, columns, 2) for the errors of a target's points."""
     columns, rows = plate.described_target().indices.max(axis=0) + 1
     return np.random.default_rng([plate.errors_seed, *stream]).standard_normal((rows, columns, 2))

@@ -67,15 +67,15 @@ class Objects:
 
     def mirror_share(self, si: SurfaceInteraction3f) -> Float:
         """Return the specular reflectance at surface points; 0 on back sides and without a hit."""
-        return dr.select(si.wi.z > 0, self._fact("mirror", si), 0.0)
+        return dr.select(si.wi.z > 0, self._gather_fact("mirror", si), 0.0)
 
     def polarisation(self, si: SurfaceInteraction3f) -> Float:
         """Return the degree of polarisation of laser light scattered by the objects hit; 0 without a hit."""
-        return self._fact("polarisation", si)
+        return self._gather_fact("polarisation", si)
 
     def roughness_um(self, si: SurfaceInteraction3f) -> Float:
         """Return the rms height of the objects hit; 0 without a hit."""
-        return self._fact("roughness_um", si)
+        return self._gather_fact("roughness_um", si)
 
     def lamp_albedo(self, si: SurfaceInteraction3f) -> Float:
         """Return the radiance of surfaces lit from the camera with the radiance 1 of a uniform sky, as `albedo`.
@@ -84,20 +84,20 @@ class Objects:
         """
         if not self.retroreflects:
             return self.albedo(si)
-        return self.albedo(si) + math.pi * dr.select(si.wi.z > 0, self._fact("retroreflection", si), 0.0)
+        return self.albedo(si) + math.pi * dr.select(si.wi.z > 0, self._gather_fact("retroreflection", si), 0.0)
 
     def spread_ahead_mm(self, si: SurfaceInteraction3f, cosine: Float) -> Float:
         """Return the mean way of light in the bodies hit, per sine of its incidence angle of the given cosine.
 
         See `twin.scene.surfaces.LateralSpread`; the way is along the surface.
         """
-        index = dr.maximum(self._fact("spread_index", si), 1.0)
+        index = dr.maximum(self._gather_fact("spread_index", si), 1.0)
         inside = dr.safe_sqrt(1 - (1 - dr.square(cosine)) / dr.square(index))
-        return self._fact("spread_path_mm", si) / (index * (1 + self._fact("spread_decay", si) * inside))
+        return self._gather_fact("spread_path_mm", si) / (index * (1 + self._gather_fact("spread_decay", si) * inside))
 
     def spread_parts(self, si: SurfaceInteraction3f) -> list[tuple[Float, Float]]:
         """Return weights and variances in mm2 of the Gaussians that spread light in the bodies hit."""
-        start, valid = GAUSSIANS * _registry_number(si.shape), si.is_valid()
+        start, valid = GAUSSIANS * _read_registry_number(si.shape), si.is_valid()
         weights, variances = self._facts["spread_weights"], self._facts["spread_variances_mm2"]
         return [
             (dr.gather(mi.Float, weights, start + k, valid), dr.gather(mi.Float, variances, start + k, valid))
@@ -106,7 +106,7 @@ class Objects:
 
     def number(self, shape: mi.ShapePtr, active: Bool) -> Int32:
         """Return the index of the objects that shapes belong to; -1 where not ``active``."""
-        number = dr.gather(mi.Float, self._facts["number"], _registry_number(shape), active)
+        number = dr.gather(mi.Float, self._facts["number"], _read_registry_number(shape), active)
         return dr.select(active, mi.Int32(number), -1)
 
     def albedo(self, si: SurfaceInteraction3f, active: Bool = True) -> Float:
@@ -115,14 +115,14 @@ class Objects:
         It equals the fraction of light from the viewer's direction that the surface scatters: the reflectance of a
         diffuse surface; for glossy surfaces it depends on direction. It is 0 on the back of one-sided surfaces.
         """
-        active = active & si.is_valid() & ((si.wi.z > 0) | (self._fact("two_sided", si) > 0))
+        active = active & si.is_valid() & ((si.wi.z > 0) | (self._gather_fact("two_sided", si) > 0))
         reflectance = si.bsdf().eval_diffuse_reflectance(view_along_normal(si), active)[0]
         if not self.glossy:
             return dr.select(active, reflectance, 0.0)
         last = len(_ALBEDO_COSINES) - 1
         place = dr.minimum(dr.abs(si.wi.z), 1.0) * last
         below = mi.UInt32(dr.minimum(dr.floor(place), last - 1))
-        start = _registry_number(si.shape) * (last + 1) + below
+        start = _read_registry_number(si.shape) * (last + 1) + below
         black, per_unit = (
             dr.lerp(
                 dr.gather(mi.Float, self._facts[key], start, active),
@@ -133,8 +133,8 @@ class Objects:
         )
         return dr.select(active, black + per_unit * reflectance, 0.0)
 
-    def _fact(self, key: str, si: SurfaceInteraction3f) -> Float:
-        return dr.gather(mi.Float, self._facts[key], _registry_number(si.shape), si.is_valid())
+    def _gather_fact(self, key: str, si: SurfaceInteraction3f) -> Float:
+        return dr.gather(mi.Float, self._facts[key], _read_registry_number(si.shape), si.is_valid())
 
 
 def build_objects(
@@ -150,7 +150,7 @@ def build_objects(
     things = scene.objects
     placed = list(zip(things, scene.object_poses(), strict=True))
     shapes = [
-        _shape(
+        _make_shape(
             thing,
             pose,
             finish_bsdf(thing, gloss=gloss, pose=pose, seed=(seed, number, _SURFACE_STREAM), **optics),
@@ -191,14 +191,14 @@ def build_objects(
     )
 
 
-def _registry_number(shape: mi.ShapePtr) -> UInt32:
+def _read_registry_number(shape: mi.ShapePtr) -> UInt32:
     """Return the numbers of shapes in Dr.Jit's registry."""
     return cast(Any, dr.reinterpret_array(mi.UInt32, shape))
 
 
 def _arrange_by_registry(shapes: list[mi.Shape], values: np.ndarray) -> Float:
     """Arrange values (objects,) or (objects, N) by the shapes' numbers in Dr.Jit's registry."""
-    number = [int(_registry_number(mi.ShapePtr(shape))[0]) for shape in shapes]
+    number = [int(_read_registry_number(mi.ShapePtr(shape))[0]) for shape in shapes]
     table = np.zeros((max(number) + 1, *values.shape[1:]), np.float32)
     table[number] = values
     flat = to_jit(table)
@@ -206,7 +206,7 @@ def _arrange_by_registry(shapes: list[mi.Shape], values: np.ndarray) -> Float:
     return flat
 
 
-def _shape(thing: AnyObject, pose: np.ndarray, bsdf: mi.BSDF, *, seed: tuple[int, ...]) -> mi.Shape:
+def _make_shape(thing: AnyObject, pose: np.ndarray, bsdf: mi.BSDF, *, seed: tuple[int, ...]) -> mi.Shape:
     """Return the shape of an object at its pose (4, 4) in the scene; ``seed`` is that of its relief."""
     surface = _triangulate(thing)
     if surface is None:
@@ -215,18 +215,18 @@ def _shape(thing: AnyObject, pose: np.ndarray, bsdf: mi.BSDF, *, seed: tuple[int
         return mi.load_dict({"type": kind, "to_world": mi.ScalarTransform4f(matrix), "bsdf": bsdf})
     if thing.finish_properties().relief_mm > 0:
         surface = add_relief(surface, thing.finish_properties(), np.random.default_rng(seed))
-    return _mesh(surface, pose, mi.load_dict({"type": "twosided", "bsdf": bsdf}) if _is_two_sided(thing) else bsdf)
+    return _make_mesh(surface, pose, mi.load_dict({"type": "twosided", "bsdf": bsdf}) if _is_two_sided(thing) else bsdf)
 
 
 def _triangulate(thing: AnyObject) -> tuple[np.ndarray, ...] | None:
-    """Return the mesh of an object in its own frame, as for `_mesh`; None if one of Mitsuba's primitives shows it.
+    """Return the mesh of an object in its own frame, as for `_make_mesh`; None if one of Mitsuba's primitives shows it.
 
     Under a relief, facets of spheres and pipes deviate by less than 2e-4 of the diameter.
     """
     rough = thing.finish_properties().relief_mm > 0
     match thing:
         case Mesh():
-            return _surface_from_file(thing)
+            return _load_surface(thing)
         case FreeForm():
             return thing.surface()
         case CirclePlate() | TargetPlate() if thing.bow_mm != 0:
@@ -279,7 +279,7 @@ def _is_two_sided(thing: AnyObject) -> bool:
     return isinstance(thing, (Mesh, FreeForm)) or thing.finish_properties().relief_mm > 0
 
 
-def _mesh(surface: tuple[np.ndarray, ...], pose: np.ndarray, bsdf: mi.BSDF) -> mi.Mesh:
+def _make_mesh(surface: tuple[np.ndarray, ...], pose: np.ndarray, bsdf: mi.BSDF) -> mi.Mesh:
     """Return a triangle mesh with its vertices in scene coordinates.
 
     ``surface`` has vertices (V, 3) in the object's own frame and faces (F, 3), and may have texture coordinates (V, 2).
@@ -298,7 +298,7 @@ def _mesh(surface: tuple[np.ndarray, ...], pose: np.ndarray, bsdf: mi.BSDF) -> m
     return mesh
 
 
-def _surface_from_file(thing: Mesh) -> tuple[np.ndarray, ...]:
+def _load_surface(thing: Mesh) -> tuple[np.ndarray, ...]:
     """Read vertices (V, 3), faces (F, 3) and, if every part has them, texture coordinates (V, 2) of a mesh file.
 
     Parts are concatenated here: trimesh would also copy their materials, which requires an imaging library.

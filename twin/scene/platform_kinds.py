@@ -284,7 +284,7 @@ class Robot(Route):
         if self.moves():
             times = np.linspace(-LEAD_S, times[-1] + LEAD_S, 2 + int((times[-1] + 2 * LEAD_S) / _ARC_S))
         base, links = self.base.matrix(), np.array(self.links)
-        angles = _joint_angles(np.linalg.inv(base) @ self.command_poses()(times), links)
+        angles = _solve_joint_angles(np.linalg.inv(base) @ self.command_poses()(times), links)
         wrong = links + self.link_std_mm * rng.standard_normal((6, 3)) * (1, 1, 0)
         zero, gear = (
             np.radians(std) * rng.standard_normal(6) for std in (self.joint_zero_std_deg, self.joint_gear_std_deg)
@@ -304,12 +304,12 @@ class Robot(Route):
         def true(wanted: np.ndarray) -> np.ndarray:
             at = joints(wanted)
             errors = zero + repeated(wanted) + gear * np.sin(2 * self.gear_ratio * at + phases)
-            return base @ _flange(at + errors, wrong)
+            return base @ _compute_flange(at + errors, wrong)
 
-        return PlatformMotion(true, lambda wanted: base @ _flange(joints(wanted), links))
+        return PlatformMotion(true, lambda wanted: base @ _compute_flange(joints(wanted), links))
 
 
-def _flange(angles: np.ndarray, links: np.ndarray) -> np.ndarray:
+def _compute_flange(angles: np.ndarray, links: np.ndarray) -> np.ndarray:
     """Return the pose (N, 4, 4) of the flange in the robot's base for joint angles (N, 6) in rad.
 
     Denavit and Hartenberg 1955.
@@ -326,7 +326,7 @@ def _flange(angles: np.ndarray, links: np.ndarray) -> np.ndarray:
     return pose
 
 
-def _joint_angles(poses: np.ndarray, links: np.ndarray) -> np.ndarray:
+def _solve_joint_angles(poses: np.ndarray, links: np.ndarray) -> np.ndarray:
     """Return joint angles (N, 6) in rad that move the flange to poses (N, 4, 4) of the base.
 
     The angles of each pose are close to the previous ones. DescriptionError if the arm does not reach a pose.
@@ -334,7 +334,7 @@ def _joint_angles(poses: np.ndarray, links: np.ndarray) -> np.ndarray:
     length = float(np.abs(links[:, :2]).sum())
 
     def misfit(angles: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-        found = _flange(angles[None], links)[0]
+        found = _compute_flange(angles[None], links)[0]
         turn = Rotation.from_matrix(found[:3, :3] @ wanted[:3, :3].T).as_rotvec()
         return np.append((found[:3, 3] - wanted[:3, 3]) / length, turn)
 

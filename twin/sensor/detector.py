@@ -99,12 +99,12 @@ def _collect(
     else:
         mean = np.empty_like(electrons, order="C")
         light, gain, hot = (values.ravel() for values in (electrons, pattern.gain, pattern.hot_e_per_s))
-        _mean_electrons(light, gain, hot, exposure_s, float(dark), mean.ravel())
+        _write_mean_electrons(light, gain, hot, exposure_s, float(dark), mean.ravel())
     return mean if rng is None else poisson_numbers(mean, rng)
 
 
 @compiled
-def _mean_electrons(
+def _write_mean_electrons(
     light: np.ndarray, gain: np.ndarray, hot_e_per_s: np.ndarray, exposure_s: float, dark: float, mean: np.ndarray
 ) -> None:
     """Write the mean electrons (N,) of pixels with individual gain and dark current (N,) to ``mean``."""

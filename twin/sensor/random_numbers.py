@@ -43,7 +43,7 @@ def poisson_numbers(mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """
     flat = np.ascontiguousarray(mean).ravel()
     numbers = np.empty(flat.shape, np.float32)
-    _fill_small_poisson(flat, *_poisson_tables(), _start(rng), rng.poisson(POISSON_STEP * flat.size), numbers)
+    _fill_small_poisson(flat, *_make_poisson_tables(), _start(rng), rng.poisson(POISSON_STEP * flat.size), numbers)
     large = np.flatnonzero(flat >= LARGEST_MEAN)
     numbers[large] = rng.poisson(flat[large])
     return numbers.reshape(mean.shape)
@@ -56,7 +56,7 @@ def add_normal_numbers(values: np.ndarray, deviation: float, rng: np.random.Gene
     ziggurat method for generating random variables", J. Statist. Software 5, 2000). It is exact to the resolution of 32
     bits.
     """
-    _add_normal_numbers(values.ravel(), deviation, *_layers(), _start(rng))
+    _add_normal_numbers(values.ravel(), deviation, *_make_layers(), _start(rng))
 
 
 def _start(rng: np.random.Generator) -> np.uint64:
@@ -85,7 +85,7 @@ def _mix(state: np.uint64) -> np.uint64:
 
 
 @compiled_part
-def _uniform(state: np.uint64) -> float:
+def _draw_uniform(state: np.uint64) -> float:
     """Return a uniform number in [0, 1) from a state."""
     return np.float64(_mix(state) >> np.uint64(11)) * 2.0**-53
 
@@ -114,7 +114,7 @@ def _fill_small_poisson(
         cell = np.int64(_mix(stream) >> np.uint64(52))
         count = np.int64(count_of_cell[level, cell])
         if count == _SEVERAL:
-            uniform = (cell + _uniform(_next(stream))) / _CELLS
+            uniform = (cell + _draw_uniform(_next(stream))) / _CELLS
             count = 0
             while distribution[level, count] <= uniform:
                 count += 1
@@ -122,14 +122,14 @@ def _fill_small_poisson(
     state = _advance(state, 2 * len(mean))
     for _ in range(events):
         state = _next(state)
-        i = np.int64(_uniform(state) * len(mean))
+        i = np.int64(_draw_uniform(state) * len(mean))
         state = _next(state)
-        if mean[i] < LARGEST_MEAN and _uniform(state) < mean[i] / step - np.floor(mean[i] / step):
+        if mean[i] < LARGEST_MEAN and _draw_uniform(state) < mean[i] / step - np.floor(mean[i] / step):
             numbers[i] += 1
 
 
 @cache
-def _poisson_tables() -> tuple[np.ndarray, np.ndarray]:
+def _make_poisson_tables() -> tuple[np.ndarray, np.ndarray]:
     """Return the count of every cell (levels, cells), and the distribution functions (levels, counts)."""
     distribution = special.pdtr(np.arange(_COUNTS), POISSON_STEP * np.arange(_LEVELS)[:, None])
     distribution[:, -1] = 1.0  # rounding may leave it below the largest uniform number
@@ -143,7 +143,7 @@ def _poisson_tables() -> tuple[np.ndarray, np.ndarray]:
 def _add_normal_numbers(
     values: np.ndarray, deviation: float, edges: np.ndarray, heights: np.ndarray, inner: np.ndarray, state: np.uint64
 ) -> None:
-    """Add normal numbers as `add_normal_numbers`; ``edges``, ``heights`` and ``inner`` come from `_layers`."""
+    """Add normal numbers as `add_normal_numbers`; ``edges``, ``heights`` and ``inner`` come from `_make_layers`."""
     for i in range(len(values)):
         while True:
             state = _next(state)
@@ -157,21 +157,21 @@ def _add_normal_numbers(
             if layer == 0:
                 # Tail beyond the last edge r: accept x = r - log(u) / r with the probability exp(-(x - r)^2 / 2)
                 # (Marsaglia 1964).
-                beyond = -math.log(1 - _uniform(state)) / _LAST_EDGE
+                beyond = -math.log(1 - _draw_uniform(state)) / _LAST_EDGE
                 state = _next(state)
-                while -2 * math.log(1 - _uniform(state)) < beyond * beyond:
+                while -2 * math.log(1 - _draw_uniform(state)) < beyond * beyond:
                     state = _next(state)
-                    beyond = -math.log(1 - _uniform(state)) / _LAST_EDGE
+                    beyond = -math.log(1 - _draw_uniform(state)) / _LAST_EDGE
                     state = _next(state)
                 x = _LAST_EDGE + beyond
                 break
-            if heights[layer] + (heights[layer + 1] - heights[layer]) * _uniform(state) < math.exp(-0.5 * x * x):
+            if heights[layer] + (heights[layer + 1] - heights[layer]) * _draw_uniform(state) < math.exp(-0.5 * x * x):
                 break
         values[i] += np.float32(deviation * (-x if bits & np.uint64(_LAYERS) else x))
 
 
 @cache
-def _layers() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _make_layers() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return outer edges divided by `_MANTISSA` (L,), floor heights (L + 1,) and inner parts (L,) of the layers.
 
     Layers are numbered from below. The lowest one contains the tail; its width is that of a rectangle with its area. A

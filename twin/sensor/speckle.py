@@ -120,7 +120,7 @@ class Speckle:
         variance = squares * coherent * (1 + polarised) / 2
         cubes = cubes * 4 * np.square(coherent) / (3 + np.square(coherent)) * (1 + 3 * polarised) / 4
         along, across = (columns, rows) if self._along_width else (rows, columns)
-        pattern = self._tile.intensity(_amplitudes(self._tile.size, self._seed, travel_mm / self.renewal_mm))
+        pattern = self._tile.intensity(_draw_amplitudes(self._tile.size, self._seed, travel_mm / self.renewal_mm))
         intensity = pattern[across % self._tile.across_px, along]
         factors = 1 + np.sqrt(variance) * _skew_exponential(intensity, cubes / variance**1.5)
         return np.maximum(factors, 0.0).astype(np.float32)
@@ -177,7 +177,7 @@ class _Tile:
         self.across_px = cast(int, fft.next_fast_len(max(_TILE_PX, least)))
         along_px = cast(int, fft.next_fast_len(max(along_px + gap, least)))
         if grain_px <= _FINE_PX:
-            power = _power_of_sums(self.across_px, along_px, grain_px)
+            power = _compute_power_of_sums(self.across_px, along_px, grain_px)
         else:
             # The lens passes frequencies within a disc of diameter 1 / (lambda N (1 + m)) (Goodman, Introduction to
             # Fourier Optics, Sec. 6.2).
@@ -195,13 +195,13 @@ class _Tile:
         return np.square(np.real(field)) + np.square(np.imag(field))
 
 
-def _power_of_sums(across_px: int, along_px: int, grain_px: float) -> np.ndarray:
+def _compute_power_of_sums(across_px: int, along_px: int, grain_px: float) -> np.ndarray:
     """Return the relative power (across, along) of a field whose intensity has the correlation of pixel integrals.
 
     The field correlation is the square root of the intensity correlation. The later transformation of the intensities
     reduces their correlation; this is compensated for monochromatic, polarised light.
     """
-    correlation = _correlation_of_sums(grain_px)
+    correlation = _compute_correlation_of_sums(grain_px)
     wanted = correlation / correlation[0, 0]
     # By Mehler's formula for exponential variables (Laguerre polynomials), the n-th term of their transform is
     # correlated by the n-th power of their correlation.
@@ -219,7 +219,7 @@ def _power_of_sums(across_px: int, along_px: int, grain_px: float) -> np.ndarray
     return np.maximum(waves(across_px) @ field @ waves(along_px).T, 0.0)
 
 
-def _correlation_of_sums(grain_px: float) -> np.ndarray:
+def _compute_correlation_of_sums(grain_px: float) -> np.ndarray:
     """Return the covariance (L, L) of intensities integrated over two pixels at each row and column distance.
 
     It is the mean of |2 J1(z) / z|^2, as in `pixel_contrast`, over pairs of points of both pixels.
@@ -234,7 +234,7 @@ def _correlation_of_sums(grain_px: float) -> np.ndarray:
     pairs = np.zeros((reach + 1, places.size))
     for lag, row in enumerate(pairs):
         row[lag * count : (lag + 2) * count] = np.concatenate([weights * part, weights * (1 - part)])
-    return pairs @ _airy(np.hypot(places[:, None], places) / grain) ** 2 @ pairs.T
+    return pairs @ _compute_airy(np.hypot(places[:, None], places) / grain) ** 2 @ pairs.T
 
 
 @cache
@@ -248,13 +248,13 @@ def _compute_third_cumulant(grain_px: float) -> float:
     nodes, weights = np.polynomial.legendre.leggauss(max(7, math.ceil(5 / grain)))
     x, y = (each.ravel() for each in np.meshgrid(nodes / 2, nodes / 2))
     root = np.sqrt(np.outer(weights, weights).ravel() / 4)
-    coherence = root[:, None] * _airy(np.hypot(x[:, None] - x, y[:, None] - y) / grain) * root
+    coherence = root[:, None] * _compute_airy(np.hypot(x[:, None] - x, y[:, None] - y) / grain) * root
     twice = coherence @ coherence
     excess = float(np.sum(twice * coherence) / np.trace(twice) ** 2) - 1
     return pixel_contrast(grain_px) ** 4 * (1 + excess * min(1.0, grain_px / _BORDER_PX))
 
 
-def _airy(grains: np.ndarray) -> np.ndarray:
+def _compute_airy(grains: np.ndarray) -> np.ndarray:
     """Return the correlation 2 J1(z) / z of the field at distances in grains."""
     z = math.pi * np.maximum(grains, 1e-9)
     return 2 * j1(z) / z
@@ -267,11 +267,11 @@ def _skew_exponential(exponential: np.ndarray, skew: ArrayLike) -> np.ndarray:
     """
     places = np.empty((2, len(exponential)))
     places[0], places[1] = np.multiply(skew, _SKEWS - 1), np.cbrt(exponential) * ((_ROOTS - 1) / _LARGEST_ROOT)
-    return ndimage.map_coordinates(_shapes(), places, order=1, mode="nearest")
+    return ndimage.map_coordinates(_compute_shapes(), places, order=1, mode="nearest")
 
 
 @cache
-def _shapes() -> np.ndarray:
+def _compute_shapes() -> np.ndarray:
     """Return quantiles (skews, roots) of distributions of mean 0 and variance 1 at those of an exponential variable.
 
     ``skews`` are half skewnesses from 0 to 1, ``roots`` cube roots of the exponential variable. The distributions are
@@ -287,7 +287,7 @@ def _shapes() -> np.ndarray:
     return np.vstack([normal, (special.gammainccinv(shape, above) - shape) / np.sqrt(shape)])
 
 
-def _amplitudes(size: int, seed: int, position: float) -> np.ndarray:
+def _draw_amplitudes(size: int, seed: int, position: float) -> np.ndarray:
     """Return circular complex Gaussian amplitudes (size,), complex64, of mean square 1.
 
     ``position`` is in renewal lengths. Independent draws belong to the nodes of a lattice; between two nodes, they are

@@ -326,7 +326,7 @@ def accept(
         requirements=requirements,
         verdict=verdict,
         conclusion=f"{verdict}: {reason}",
-        remarks=(*_remarks(stated, characteristics), *_warnings(judged), *edited),
+        remarks=(*_list_remarks(stated, characteristics), *_list_warnings(judged), *edited),
         calibration=None if calibration is None else calibration_digest(calibration),
         software=f"uwlts {__version__}",
         date=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -414,7 +414,7 @@ def _measure_cloud(file: Path, calibration: AnyCalibration | None) -> PointCloud
         return reconstruct(capture, calibration, with_uncertainty=False)
 
 
-def _remarks(plan: AcceptancePlan, characteristics: Sequence[Characteristic]) -> Iterator[str]:
+def _list_remarks(plan: AcceptancePlan, characteristics: Sequence[Characteristic]) -> Iterator[str]:
     for each in characteristics:
         if each.mpe_mm is None:
             yield f"{each.symbol}: no maximum permissible error is stated"
@@ -430,7 +430,7 @@ def _remarks(plan: AcceptancePlan, characteristics: Sequence[Characteristic]) ->
             yield f"{name}: temperature or expansion is not stated; the test value uncertainty does not contain it"
 
 
-def _warnings(judged: Sequence[JudgedPosition]) -> list[str]:
+def _list_warnings(judged: Sequence[JudgedPosition]) -> list[str]:
     """Return the warnings of the clouds, each with its positions."""
     where: dict[str, list[str]] = {}
     for position in judged:

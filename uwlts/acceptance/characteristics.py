@@ -296,7 +296,7 @@ def measure_position(
         case SphereStandard():
             spheres = measure_spheres(points, standard, margin_mm=margin)
             for number, (sphere, diameter) in enumerate(zip(spheres, standard.diameters_mm, strict=True), start=1):
-                by_size = _size_expanded_mm(artefact, standard.diameter_uncertainty_mm, diameter, temperature)
+                by_size = _expand_size_mm(artefact, standard.diameter_uncertainty_mm, diameter, temperature)
                 centre, label = sphere.fit.centre_mm, f"sphere {number}"
                 add("PF", label, sphere.range_mm, form, centre)
                 add("PF95", label, sphere.range_95_mm, form, centre)
@@ -305,7 +305,7 @@ def measure_position(
             for number, calibrated in enumerate(standard.spacings_mm, start=1):
                 one, other = centres[number - 1 : number + 1]
                 spacing = float(np.linalg.norm(other - one))
-                by_size = _size_expanded_mm(artefact, standard.spacing_uncertainty_mm, calibrated, temperature)
+                by_size = _expand_size_mm(artefact, standard.spacing_uncertainty_mm, calibrated, temperature)
                 label = "spacing" if len(standard.spacings_mm) == 1 else f"spacing {number}-{number + 1}"
                 direction = ((other - one) / spacing).tolist()
                 known = {"length_mm": calibrated, "direction": direction}
@@ -321,7 +321,7 @@ def measure_position(
         case StepStandard():
             step = measure_step_height(points, frame, standard)
             height, known = standard.height_mm, {"length_mm": standard.height_mm, "direction": step.normal}
-            by_size = _size_expanded_mm(artefact, standard.height_uncertainty_mm, height, temperature)
+            by_size = _expand_size_mm(artefact, standard.height_uncertainty_mm, height, temperature)
             add("E", "height", step.height_error_mm, by_size, np.array(step.point_mm), **known)
             return values, step.points_used, 0
         case PipeStandard():
@@ -351,7 +351,7 @@ def judge_characteristic(
         judged: list[tuple[Decision, str]] = [("no MPE", "") if mpe_mm is None else ("undecided", "not measured")]
     order = get_args(Decision)
     decision, reason = min(judged, key=lambda each: order.index(each[0]))
-    chances = [_probability(each, limit) for each, limit in zip(matching, limits, strict=True)]
+    chances = [_compute_probability(each, limit) for each, limit in zip(matching, limits, strict=True)]
     known = [chance for chance in chances if chance is not None]
     return Characteristic(
         **stated,
@@ -374,7 +374,7 @@ def _decide(value: CharacteristicValue, limit_mm: float | None, rule: DecisionRu
     return decision, f"the limit is within the guard band ({where})" if decision == "undecided" else ""
 
 
-def _probability(value: CharacteristicValue, limit_mm: float | None) -> float | None:
+def _compute_probability(value: CharacteristicValue, limit_mm: float | None) -> float | None:
     """Return the probability that the true value is within the limits; None without limit or uncertainty."""
     if limit_mm is None or not value.expanded_mm:
         return None
@@ -391,7 +391,7 @@ def _form_expanded_mm(artefact: CertifiedArtefact) -> float | None:
     return None if form is None else COVERAGE_FACTOR * float(np.hypot(form / 2, artefact.form_uncertainty_mm / 2))
 
 
-def _size_expanded_mm(
+def _expand_size_mm(
     artefact: CertifiedArtefact, calibrated_expanded_mm: float | None, length_mm: float, temperature: Temperature | None
 ) -> float | None:
     """Return the test value uncertainty (k = 2) of a calibrated size (ISO/TS 23165); None if not certified.

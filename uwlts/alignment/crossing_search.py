@@ -197,7 +197,7 @@ def correlate_heights(
     Image Processing 21, 2012) and weighted by the square root of its area.
     """
     low = np.minimum(source_mm[:, :2].min(axis=0), target_mm[:, :2].min(axis=0))
-    maps = [_height_map(points, low, pixel_mm) for points in (source_mm, target_mm)]
+    maps = [_make_height_map(points, low, pixel_mm) for points in (source_mm, target_mm)]
     sizes: list[Any] = [
         next_fast_len(a + b - 1, real=True) for a, b in zip(maps[0][0].shape, maps[1][0].shape, strict=True)
     ]
@@ -238,7 +238,7 @@ def correlate_heights(
     return [shift for shift in found if abs(shift[2]) <= reach_mm[2] + pixel_mm]
 
 
-def _height_map(points: np.ndarray, low: np.ndarray, pixel: float) -> tuple[np.ndarray, np.ndarray]:
+def _make_height_map(points: np.ndarray, low: np.ndarray, pixel: float) -> tuple[np.ndarray, np.ndarray]:
     """Return mean heights (H, W), and a mask (H, W) of pixels with points."""
     cells = np.floor((points[:, :2] - low) / pixel).astype(np.int64)
     shape = tuple(cells.max(axis=0) + 1)

@@ -69,7 +69,7 @@ class DriftModel:
             by_rates = t * u
         else:
             # A stationary rate has stationary increments, whose variance determines the covariance.
-            of_t, of_u, of_both, of_end = map(self._increment, (t, u, np.abs(t - u), 1.0))
+            of_t, of_u, of_both, of_end = map(self._find_increment, (t, u, np.abs(t - u), 1.0))
             by_rates = (of_t + of_u - of_both) / (2 * of_end)
         return variance * ((1 - walk) * by_rates + walk * np.minimum(t, u))
 
@@ -80,10 +80,10 @@ class DriftModel:
         """
         by_rates, by_walk = 0.0, step / 4
         if np.isfinite(self.correlation):
-            by_rates = (self._increment(step / 2) - self._increment(step) / 4) / self._increment(1.0)
+            by_rates = (self._find_increment(step / 2) - self._find_increment(step) / 4) / self._find_increment(1.0)
         return self.std * np.sqrt(np.maximum((1 - self.walk) * by_rates + self.walk * by_walk, 0.0))
 
-    def _increment(self, t: np.ndarray | float) -> np.ndarray:
+    def _find_increment(self, t: np.ndarray | float) -> np.ndarray:
         """Return the variance of the integral over a time t of a rate with the correlation exp(-a).
 
         A smooth rate has the correlation (1 + a) exp(-a) (Matern: Rasmussen and Williams, Gaussian Processes for
@@ -129,14 +129,14 @@ def choose_drift_model(trajectory: Trajectory, drift_mm: float | None, drift_deg
     grown = np.maximum(variance.max(axis=0) - variance[0], _LEAST_DRIFT**2)
     # The difference between two absolute measurements has up to twice the variance of one.
     measured = (grown < variance[0]) & (2 * variance[0] < np.repeat(grown.reshape(2, 3).max(axis=1), 3))
-    parts = np.array([_rate_and_walk(trajectory.times_s, each) for each in (variance / grown).T])
+    parts = np.array([_split_rate_and_walk(trajectory.times_s, each) for each in (variance / grown).T])
     parts *= grown[:, None]
     parts[measured] = np.column_stack([np.zeros(6), 2 * variance[0]])[measured]
     size = np.maximum(parts.sum(axis=1), _LEAST_DRIFT**2)
     return DriftModel(np.sqrt(size), parts[:, 1] / size, np.inf, False, dead_reckoned, True)
 
 
-def _rate_and_walk(times_s: np.ndarray, variance: np.ndarray) -> np.ndarray:
+def _split_rate_and_walk(times_s: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """Split a variance (N,) into contributions (2,) of a constant rate and a random walk at the end of the path.
 
     The drift may begin before the first pose. The best such time is found by least squares of relative errors.
@@ -231,7 +231,7 @@ class PathPrior:
     def times_root(self, matrix: np.ndarray) -> np.ndarray:
         """Return R times a matrix (6 C, K)."""
         parts = np.empty((6, self.count, matrix.shape[1]))
-        parts[:, self.order] = self._times_triangles(matrix, transposed=False)
+        parts[:, self.order] = self._multiply_by_triangles(matrix, transposed=False)
         if self.drift.dead_reckoned:
             parts[0] -= self._turned[1] @ parts[5]
             parts[1] += self._turned[0] @ parts[5]
@@ -244,9 +244,9 @@ class PathPrior:
             parts = matrix.reshape(6, self.count, -1)
             parts[5] += self._turned[0].T @ parts[1] - self._turned[1].T @ parts[0]
         parts = matrix.reshape(6, self.count, -1)[:, self.order]
-        return self._times_triangles(parts, transposed=True).reshape(matrix.shape)
+        return self._multiply_by_triangles(parts, transposed=True).reshape(matrix.shape)
 
-    def _times_triangles(self, matrix: np.ndarray, *, transposed: bool) -> np.ndarray:
+    def _multiply_by_triangles(self, matrix: np.ndarray, *, transposed: bool) -> np.ndarray:
         """Return products (6, M, K) of the roots of the first M coordinates, or of their transposes, with a matrix.
 
         BLAS multiplies triangles in half the time of full matrices; it takes and returns transposed arrays.
@@ -275,7 +275,7 @@ class PathPrior:
 
         def times_seen_root(matrix: np.ndarray) -> np.ndarray:
             parts = matrix.reshape(6, count, -1)
-            result = self._times_triangles(parts, transposed=True).reshape(matrix.shape)
+            result = self._multiply_by_triangles(parts, transposed=True).reshape(matrix.shape)
             if aside is not None:
                 heading = aside[0].T @ parts[1] - aside[1].T @ parts[0]
                 heading[:count] += result[5 * count :]

@@ -105,14 +105,14 @@ class PathEstimate:
     def relative_movement(self, pair: Pair, at_mm: np.ndarray) -> np.ndarray:
         """Return the derivatives (6, 6 C) of the later piece's motion relative to the earlier one at a place (3,)."""
         basis = self.prior.basis(self._middle_times_s[list(pair)])
-        return np.einsum("ipj,pc->ijc", self._relative_twists(pair, at_mm), basis).reshape(6, -1)
+        return np.einsum("ipj,pc->ijc", self._compute_relative_twists(pair, at_mm), basis).reshape(6, -1)
 
     def relative_covariance(self, pair: Pair, at_mm: np.ndarray) -> np.ndarray:
         """Return the covariance (6, 6) of the later piece's motion relative to the earlier one at a place (3,)."""
-        by = self._relative_twists(pair, at_mm).reshape(6, 12)
+        by = self._compute_relative_twists(pair, at_mm).reshape(6, 12)
         return by @ self._middle_covariance[np.ix_(pair, range(6), pair, range(6))].reshape(12, 12) @ by.T
 
-    def _relative_twists(self, pair: Pair, at_mm: np.ndarray) -> np.ndarray:
+    def _compute_relative_twists(self, pair: Pair, at_mm: np.ndarray) -> np.ndarray:
         """Return the derivatives (6, 2, 6) of this motion by the corrections in the middle of both pieces."""
         result = np.zeros((6, 2, 6))
         for column, number, sign in zip((0, 1), pair, (-1.0, 1.0), strict=True):

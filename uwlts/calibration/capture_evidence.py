@@ -223,7 +223,7 @@ def explain_captures_without_stripe(captures: Sequence[Capture]) -> str:
     if not count:
         return f"{_names(captures)}: no image with the laser on; take one at every position"
     along, where = header.sensor.camera.stripe_along, f"laser images of {_names(captures)}"
-    lit = [image for capture in captures for image in _laser_images(capture, _LOOKED_AT)]
+    lit = [image for capture in captures for image in _choose_laser_images(capture, _LOOKED_AT)]
     if not lit:
         return f"no stripe in any of the {count} centre lines of {_names(captures)}: is the laser on?"
     full_dn = header.saturation_dn
@@ -241,7 +241,7 @@ def _explain_missing_target(captures: Sequence[Capture], target: Target, reasons
     """Return the reason why no image shows the target; ``reasons`` counts the faults of images with the laser off."""
     if not any(map(len, captures)):
         return "there are no images in it"
-    for image in [image for capture in captures for image in _laser_images(capture, 3)]:
+    for image in [image for capture in captures for image in _choose_laser_images(capture, 3)]:
         with suppress(TargetError, CalibrationError):
             target.detect(image)
             return (
@@ -254,7 +254,7 @@ def _explain_missing_target(captures: Sequence[Capture], target: Target, reasons
     return "; ".join(f"{reason} ({times} of {count} images)" for reason, times in reasons.most_common(2))
 
 
-def _laser_images(capture: Capture, most: int) -> Iterator[np.ndarray]:
+def _choose_laser_images(capture: Capture, most: int) -> Iterator[np.ndarray]:
     """Yield at most ``most`` images with the laser on, evenly chosen; images of 3D cameras are skipped."""
     lit = np.flatnonzero(capture.laser_on & capture.has_image)
     for place in np.unique(np.linspace(0, len(lit) - 1, most).astype(int)) if len(lit) else ():
@@ -296,7 +296,7 @@ def _find_target_stripe(
     if not len(here):
         return f"no target was found at {capture.stage_mm[frame]:g} mm"
     place = int(here[0])
-    along, options, clip = _stripe_settings(capture, settings)
+    along, options, clip = _read_stripe_settings(capture, settings)
     try:
         found = stripe_on_target(seen, views[place], target, stripe_along=along, options=options, saturation=clip)
     except ImageError as error:
@@ -306,7 +306,7 @@ def _find_target_stripe(
 
 def _find_stripe(capture: Capture, settings: StripeSettings, numbered: _Seen) -> np.ndarray | str:
     """Find the stripe (N, 2) of a laser frame, or return the reason for rejection."""
-    along, options, clip = _stripe_settings(capture, settings)
+    along, options, clip = _read_stripe_settings(capture, settings)
     try:
         pixels = find_stripe(numbered[1], stripe_along=along, options=options, saturation=clip).pixels()
     except ImageError as error:
@@ -314,7 +314,7 @@ def _find_stripe(capture: Capture, settings: StripeSettings, numbered: _Seen) ->
     return _explain_short_stripe(pixels) or pixels
 
 
-def _stripe_settings(capture: Capture, settings: StripeSettings) -> tuple[str, StripeOptions, float]:
+def _read_stripe_settings(capture: Capture, settings: StripeSettings) -> tuple[str, StripeOptions, float]:
     sensor = capture.header.sensor
     return sensor.camera.stripe_along, StripeOptions.resolve(sensor, settings), capture.header.saturation_dn
 

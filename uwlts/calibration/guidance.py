@@ -403,7 +403,7 @@ def format_pose_advice(aim: np.ndarray, state: State, pose: np.ndarray | None) -
     parts, (wanted, wanted_mm) = [], middle_of(aim, state)
     place, distance = (None, None) if pose is None else middle_of(pose, state)
     if pose is None or np.arccos(np.clip(pose[:3, 2] @ aim[:3, 2], -1, 1)) > _SAME_TILT_RAD:
-        parts.append(_tilt_words(aim, pose))
+        parts.append(_describe_tilt(aim, pose))
     if place is None or not np.linalg.norm(np.subtract(place, wanted)) <= _SAME_PLACE:
         there = place_words(*wanted)
         nothing = ": nothing seen there yet" if there == state.coverage.emptiest() else ""
@@ -416,7 +416,7 @@ def format_pose_advice(aim: np.ndarray, state: State, pose: np.ndarray | None) -
     return "; ".join(parts) or "hold it still, just like this"
 
 
-def _tilt_words(aim: np.ndarray, pose: np.ndarray | None) -> str:
+def _describe_tilt(aim: np.ndarray, pose: np.ndarray | None) -> str:
     """Describe how to tilt the target: the side to move away, and the angle."""
     across, down = tilts_rad(aim)
     size, present = (np.degrees(np.arccos(np.clip(abs(p[2, 2]), 0, 1))) for p in (aim, aim if pose is None else pose))

@@ -56,7 +56,7 @@ def stripe_on_target(
         return TargetStripe(np.empty((0, 2)), len(lines))
     near = curve.holds(lines, across)
     along_curve = np.arange(len(stripe.status))
-    expected = _mask_plate(_pixels(along_curve, curve.polynomial(along_curve), stripe_along), to_plate, target)
+    expected = _mask_plate(_list_pixels(along_curve, curve.polynomial(along_curve), stripe_along), to_plate, target)
     missing = np.setdiff1d(along_curve[expected], lines[near])
     outliers = int(np.count_nonzero(~near))
     lines, across = lines[near], across[near]
@@ -68,10 +68,10 @@ def stripe_on_target(
         near = curve.holds(lines, across)
         lines, across = lines[near], across[near]
     order = np.argsort(lines)
-    return TargetStripe(_pixels(lines[order], across[order], stripe_along), outliers)
+    return TargetStripe(_list_pixels(lines[order], across[order], stripe_along), outliers)
 
 
-def _pixels(lines: np.ndarray, across: np.ndarray, stripe_along: str) -> np.ndarray:
+def _list_pixels(lines: np.ndarray, across: np.ndarray, stripe_along: str) -> np.ndarray:
     """Return image coordinates (N, 2) of positions on profile lines."""
     return np.column_stack((across, lines) if stripe_along == "height" else (lines, across)).astype(np.float64)
 

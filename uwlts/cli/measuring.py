@@ -55,14 +55,14 @@ def reconstruct(
     if until := cloud.metadata.get(VERIFIED):
         say(f"calibration verified until {until}")
     say(f"laser images with a point: {len(seen)} of {lit}")
-    say(f"profile lines: {_counts(cloud.lines_by_status)}")
-    if lost := _counts({name: count for name, count in cloud.rays_by_status.items() if name != "ok"}):
+    say(f"profile lines: {_format_counts(cloud.lines_by_status)}")
+    if lost := _format_counts({name: count for name, count in cloud.rays_by_status.items() if name != "ok"}):
         say(f"stripe centres without a point: {lost}")
     say(cloud_written(out, cloud.rays_by_status["ok"]))
     note_lean(out, cloud)
 
 
-def _counts(by_status: dict[str, int]) -> str:
+def _format_counts(by_status: dict[str, int]) -> str:
     return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in by_status.items() if count)
 
 

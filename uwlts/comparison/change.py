@@ -118,10 +118,10 @@ class SurfaceChange(Brief):
             links = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(chosen),) * 2)
             owner = connected_components(links, directed=False)[1]
             for number in np.flatnonzero(np.bincount(owner) >= OPTIONS.fewest_of_region):
-                found.append(self._region(chosen[owner == number]))
+                found.append(self._describe_region(chosen[owner == number]))
         return sorted(found, key=lambda region: -abs(region.volume_mm3))
 
-    def _region(self, members: np.ndarray) -> ChangedRegion:
+    def _describe_region(self, members: np.ndarray) -> ChangedRegion:
         distance, area, points = self.distance_mm[members], self.area_mm2[members], self.points_mm[members]
         # Scattered points without neighbours have no area.
         area = area if area.any() else np.ones_like(area)

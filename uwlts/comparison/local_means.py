@@ -97,19 +97,19 @@ def average_locally(
         off = along - centre[place]
         scatter = np.bincount(place, off**2, minlength=size) / np.maximum(number - 1, 1)
         count[block], mean[block] = number, centre
-        rough[block] = scatter / np.maximum(number, 1) * _student_ratio(number) ** 2
+        rough[block] = scatter / np.maximum(number, 1) * _compute_student_ratio(number) ** 2
         if frame is not None:
-            together[block], alone[block] = _image_sums(place, frame[point], off, scatter, number)
+            together[block], alone[block] = _sum_by_images(place, frame[point], off, scatter, number)
         if uncertainty is not None:
             found = _propagate_variance(place, point, own_normals, uncertainty, frame, number)
             stated[block], other[block], patterns[block] = found
     # The empirical scatter includes that between images.
-    variance = np.maximum(_correlation_factor(together, alone, count) * rough, stated + other)
+    variance = np.maximum(_estimate_correlation_factor(together, alone, count) * rough, stated + other)
     mean[count < OPTIONS.fewest_points] = np.nan
     return LocalMeans(mean, variance, patterns)
 
 
-def _student_ratio(number: np.ndarray) -> np.ndarray:
+def _compute_student_ratio(number: np.ndarray) -> np.ndarray:
     """Return the ratio (P,) of Student's quantile to the normal one for numbers of points (P,)."""
     table = np.ones(_NEARLY_NORMAL + 1)
     table[2:_NEARLY_NORMAL] = t_distribution.ppf(0.975, np.arange(1, _NEARLY_NORMAL - 1)) / TWO_SIDED
@@ -154,7 +154,7 @@ def _propagate_variance(
     return single, result, moves
 
 
-def _image_sums(
+def _sum_by_images(
     place: np.ndarray, image: np.ndarray, off: np.ndarray, scatter: np.ndarray, number: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the squared sums (P,) of residuals of each image, and their expectation for independent points.
@@ -177,7 +177,7 @@ def _place_images(place: np.ndarray, image: np.ndarray) -> tuple[np.ndarray, np.
     return keys // many, owner
 
 
-def _correlation_factor(together: np.ndarray, alone: np.ndarray, count: np.ndarray) -> float:
+def _estimate_correlation_factor(together: np.ndarray, alone: np.ndarray, count: np.ndarray) -> float:
     """Return the factor (at least 1) by which correlated noise within an image increases the variance of means.
 
     It is estimated from all places together, because each has few images. Places of high scatter are excluded, since

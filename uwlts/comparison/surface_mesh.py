@@ -110,7 +110,7 @@ def mesh(
     cube = cube_mm or max(min(radius / _CUBES_OF_RADIUS, _thinnest_wall(points, radius) / _CUBES_OF_WALL), radius / 16)
     surface = LocalSurface(points, radius_mm=radius)
     low = points.points_mm.min(axis=0) - 4 * cube
-    vertices, faces = _march_cubes(*_signed_distances(surface, points.points_mm, low, cube, progress))
+    vertices, faces = _march_cubes(*_compute_signed_distances(surface, points.points_mm, low, cube, progress))
     places = low + cube * vertices
     del vertices
     patches = surface.patches(places, with_uncertainty=True)
@@ -204,7 +204,7 @@ def _thinnest_wall(points: SurfacePoints, radius: float) -> float:
     return float(np.quantile(thickness[chosen], 0.02, method="lower")) if len(chosen) else np.inf
 
 
-def _corners_near(cells: np.ndarray) -> np.ndarray:
+def _list_corners_near(cells: np.ndarray) -> np.ndarray:
     """Return the corners (C, 3) of cubes that hold points, and of cubes up to two away."""
     shape = cells.max(axis=0) + 8
     keys = _sort_unique(np.asarray(np.ravel_multi_index(tuple(cells.T + 3), tuple(shape))))
@@ -222,14 +222,14 @@ def _sort_unique(keys: np.ndarray) -> np.ndarray:
     return keys[np.append(True, keys[1:] != keys[:-1])] if len(keys) else keys
 
 
-def _signed_distances(
+def _compute_signed_distances(
     surface: LocalSurface, points_mm: np.ndarray, low: np.ndarray, cube: float, progress: ProgressListener
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return corners (C, 3) of cubes near points, from ``low`` on, and their distances (C,) in cubes from the surface.
 
     Distances are positive outside. Only corners with a patch are returned.
     """
-    corners = _corners_near(np.floor((points_mm - low) / cube).astype(np.int64))
+    corners = _list_corners_near(np.floor((points_mm - low) / cube).astype(np.int64))
     distance, known = np.zeros(len(corners)), np.zeros(len(corners), bool)
     for start in range(0, len(corners), _PLACES_AT_A_TIME):
         here = slice(start, start + _PLACES_AT_A_TIME)

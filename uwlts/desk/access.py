@@ -38,11 +38,11 @@ _POLICY = (
 
 def is_local(host: str) -> bool:
     """Return whether a host is reachable from this machine only."""
-    address = _address(host)
+    address = _parse_address(host)
     return host == "localhost" or (address is not None and address.is_loopback)
 
 
-def _address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+def _parse_address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
     try:
         return ipaddress.ip_address(name)
     except ValueError:
@@ -89,14 +89,14 @@ class PageAccess:
         name = found[1].strip("[]").lower()
         if is_local(name):
             return True
-        bound = _address(self.host)
+        bound = _parse_address(self.host)
         if is_local(self.host):
             return False
         if bound is not None and bound.is_unspecified:
             # After DNS rebinding the Host is still the attacker's name, never an IP address.
             machine = socket.gethostname().lower()
-            return _address(name) is not None or name in (machine, f"{machine}.local")
-        return name == self.host.lower() or (bound is not None and _address(name) == bound)
+            return _parse_address(name) is not None or name in (machine, f"{machine}.local")
+        return name == self.host.lower() or (bound is not None and _parse_address(name) == bound)
 
     def is_operator(self, headers: Headers) -> bool:
         """Return whether a request has the token's cookie."""

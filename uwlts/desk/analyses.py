@@ -320,7 +320,7 @@ class Analyses:
         """
         if self.state.running:
             raise DescriptionError(f"{self.state.title} is running: wait until it ends, or cancel it")
-        values, inputs = self._values(kind, given)
+        values, inputs = self._complete_values(kind, given)
         name = name.strip() or name_results(kind, given)
         endings = ANALYSES[kind].endings or (values[_FORMAT],)
         endings += (".pdf",) if values.get("pdf") else ()
@@ -337,7 +337,7 @@ class Analyses:
         self._thread = threading.Thread(target=self._run, args=work, name="analysis", daemon=True)
         self._thread.start()
 
-    def _values(self, kind: str, given: Mapping[str, Any]) -> tuple[dict[str, Any], list[Path]]:
+    def _complete_values(self, kind: str, given: Mapping[str, Any]) -> tuple[dict[str, Any], list[Path]]:
         """Return the parameters with paths, without empty ones, and the input files."""
         values, inputs = {}, []
         for each in list_fields(kind):

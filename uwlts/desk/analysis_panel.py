@@ -59,7 +59,7 @@ class AnalysisPanel:
         """Build the fields of the chosen analysis."""
         self._form.clear()
         self._fields.clear()
-        files = _files_by_kind(self._folder)
+        files = _list_files_by_kind(self._folder)
         with self._form:
             for each in list_fields(str(self._kind.value)):
                 made = _make_field(each, files)
@@ -80,7 +80,7 @@ class AnalysisPanel:
 
     def set_files(self) -> None:
         """Offer the folder's present files."""
-        files = _files_by_kind(self._folder)
+        files = _list_files_by_kind(self._folder)
         for each, made in self._fields.values():
             if each.file_kind:
                 options = _options(each, files)
@@ -141,7 +141,7 @@ def _make_field(each: AnalysisField, files: dict[str, list[str]]) -> Any:
     return ui.checkbox(each.label) if each.switch else NumberField(each.label).props("dense")
 
 
-def _files_by_kind(folder: Path) -> dict[str, list[str]]:
+def _list_files_by_kind(folder: Path) -> dict[str, list[str]]:
     """Return the names of the folder's files by kind, the latest first; only orders among the descriptions."""
     found: dict[str, list[str]] = {}
     for file in list_files(folder):

@@ -99,7 +99,7 @@ class BoardView:
         text, colour = _LASER[board.laser]
         self._laser.set_text(text)
         self._laser.classes(remove=" ".join(each for _, each in _LASER.values()), add=colour)
-        self._phase.set_text(_progress_text(board))
+        self._phase.set_text(_describe_progress(board))
         progress = board.progress
         self._bar.set_value(progress.done / progress.total if progress.total else 0.0)
         waiting = progress.busy and not progress.total
@@ -134,7 +134,7 @@ class BoardView:
                 self._log.remove(-1)
 
 
-def _progress_text(board: Board) -> str:
+def _describe_progress(board: Board) -> str:
     progress, place = board.progress, board.position_mm
     text = progress.phase
     if progress.total is not None:

@@ -61,7 +61,7 @@ def list_files(folder: Path) -> list[ListedFile]:
             is_file = entry.is_file(follow_symlinks=False)
             if is_file and guess_kind(entry.name) and not entry.name.startswith("."):
                 about = entry.stat(follow_symlinks=False)
-                if kind := _kind_by_content(entry.path, about.st_mtime_ns):
+                if kind := _find_kind_by_content(entry.path, about.st_mtime_ns):
                     found.append(ListedFile(entry.name, kind, about.st_size, about.st_mtime))
     return sorted(found, key=lambda file: file.time_s, reverse=True)[:_SHOWN]
 
@@ -72,7 +72,7 @@ def guess_kind(name: str) -> str:
 
 
 @lru_cache(_REMEMBERED)
-def _kind_by_content(path: str, changed_ns: int) -> str:
+def _find_kind_by_content(path: str, changed_ns: int) -> str:
     """Return the kind of a file, by the label in it if its name is ambiguous; empty for other programs' files."""
     kind = guess_kind(os.path.basename(path))
     try:

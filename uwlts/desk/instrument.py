@@ -281,7 +281,7 @@ class Instrument:
             raise HardwareError("no stage is connected")
         return stage
 
-    def _rig_of(self, connected: _Connected) -> Rig:
+    def _prepare_rig(self, connected: _Connected) -> Rig:
         """Return the rig, a new one after another task has used camera or stage."""
         if self._rig is None:
             plan, stage = connected.plan, connected.stage
@@ -307,7 +307,7 @@ class Instrument:
         """Move the stage to a position."""
         connected = self._begin(f"moving to {position_mm:.3f} mm")
         self._stage()
-        self._board.position_mm = self._rig_of(connected).move_to(position_mm)
+        self._board.position_mm = self._prepare_rig(connected).move_to(position_mm)
 
     def jog(self, by_mm: float) -> None:
         """Move the stage by some mm."""
@@ -330,7 +330,7 @@ class Instrument:
             raise HardwareError("choose first which light is shown")
         if light == "laser":
             self._board.laser = "flashing"
-        found = self._rig_of(connected).find_exposure(light, start_ms=self.exposure_ms[light])
+        found = self._prepare_rig(connected).find_exposure(light, start_ms=self.exposure_ms[light])
         if found is None:
             self._board.say(f"too dark for a {light} image even at the longest exposure", "warning")
             return
@@ -352,7 +352,7 @@ class Instrument:
             self._end_live()
             return
         try:
-            frame = self._rig_of(connected).frame(light, self.exposure_ms[light])
+            frame = self._prepare_rig(connected).frame(light, self.exposure_ms[light])
         except HardwareError:
             # A busy computer loses frames occasionally.
             self._lost += 1

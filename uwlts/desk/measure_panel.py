@@ -76,11 +76,11 @@ class Plot:
         parts = [f'<rect width="{_WIDTH}" height="{_HEIGHT}" fill="white"/>']
         for value, text in ticks(*self.across_range):
             at = x(value)
-            parts.append(_line(at, _TOP, at, _HEIGHT - _BOTTOM, "#dde2e8"))
+            parts.append(_draw_line(at, _TOP, at, _HEIGHT - _BOTTOM, "#dde2e8"))
             parts.append(_text(at, _HEIGHT - _BOTTOM + 13, text, "middle"))
         for value, text in ticks(*up_range):
             at = y(value)
-            parts.append(_line(_LEFT, at, _WIDTH - _RIGHT, at, "#dde2e8"))
+            parts.append(_draw_line(_LEFT, at, _WIDTH - _RIGHT, at, "#dde2e8"))
             parts.append(_text(_LEFT - 4, at + 4, text, "end"))
         parts.append(_text((_LEFT + _WIDTH - _RIGHT) / 2, _HEIGHT - 6, self.across_label, "middle"))
         middle = (_TOP + _HEIGHT - _BOTTOM) / 2
@@ -98,7 +98,7 @@ class Plot:
             )
             parts.append(f'<path d="{path}" fill="#3573b1"/>')
         for across, up in self.marks:
-            parts.append(_line(x(across), _TOP, x(across), _HEIGHT - _BOTTOM, "#b5303c"))
+            parts.append(_draw_line(x(across), _TOP, x(across), _HEIGHT - _BOTTOM, "#b5303c"))
             parts.append(f'<circle cx="{x(across):.1f}" cy="{y(up):.1f}" r="4" fill="none" stroke="#b5303c"/>')
         return "".join(parts)
 
@@ -127,7 +127,7 @@ def _scale(low: float, high: float, first: float, last: float):
     return pixel
 
 
-def _line(x: float, y: float, to_x: float, to_y: float, colour: str) -> str:
+def _draw_line(x: float, y: float, to_x: float, to_y: float, colour: str) -> str:
     return f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{to_x:.1f}" y2="{to_y:.1f}" stroke="{colour}"/>'
 
 
@@ -187,7 +187,7 @@ class MeasurePanel:
         )
         self._places = ui.label("no point is picked").classes("text-sm font-mono whitespace-pre-wrap")
         with ui.row().classes("gap-1"):
-            self._button("length", self._length).props("dense")
+            self._button("length", self._add_length).props("dense")
             self._button("section", self._cut).props("outline dense")
             self._button("live profile", self._follow).props("outline dense")
             self._button("forget", self._forget).props("flat dense")
@@ -245,7 +245,7 @@ class MeasurePanel:
         self._mark([])
         self._places.set_text("no point is picked")
 
-    def _cloud(self) -> tuple[PointCloud, str]:
+    def _choose_cloud(self) -> tuple[PointCloud, str]:
         """Return the opened cloud, or else that of the running scan, and the reason why it has no uncertainty."""
         if (opened := self._measuring.cloud) is not None:
             return opened, _WITHOUT
@@ -258,13 +258,13 @@ class MeasurePanel:
             raise DescriptionError("click two points in the cloud first")
         return self._measuring.picked
 
-    def _length(self) -> None:
-        (first, second), (cloud, without) = self._require_two(), self._cloud()
+    def _add_length(self) -> None:
+        (first, second), (cloud, without) = self._require_two(), self._choose_cloud()
         found = measure_length(cloud, find_nearest_point(cloud, first), find_nearest_point(cloud, second))
         self._add(found, self._board.cloud_name, without)
 
     async def _shape(self, shape: Shape) -> None:
-        picked, (cloud, without) = self._measuring.picked, self._cloud()
+        picked, (cloud, without) = self._measuring.picked, self._choose_cloud()
         if not picked:
             raise DescriptionError("click a point in the cloud first")
         radius, source = _require_positive(self._radius, "the radius about the point"), self._board.cloud_name
@@ -277,7 +277,7 @@ class MeasurePanel:
     # In a section or a profile
 
     def _cut(self) -> None:
-        (first, second), (cloud, self._without) = self._require_two(), self._cloud()
+        (first, second), (cloud, self._without) = self._require_two(), self._choose_cloud()
         self._section = cut_section(cloud, first, second, width_mm=_require_positive(self._width, "the width"))
         self._live, self._source = False, f"{self._board.cloud_name}, section"
         self._places_mm = sorted([0.0, float((second - first) @ self._section.direction)])
@@ -344,7 +344,7 @@ class MeasurePanel:
         self._caption.set_text(f"{self._source}: {text}")
 
     def _show_histogram(self) -> None:
-        cloud, _ = self._cloud()
+        cloud, _ = self._choose_cloud()
         name = str(self._field.value)
         known = {"Z": cloud.points_mm[:, 2], "intensity": cloud.intensity, "deviation": cloud.deviation_mm}[name]
         values = np.empty(0) if known is None else known[np.isfinite(known)].astype(float)
@@ -373,17 +373,17 @@ class MeasurePanel:
                     self._rows[value.number] = _Row(value.number, self._measuring, self._button, self._board)
             self._rows[value.number].show(value, place)
         self._ending.set_visibility(bool(values.values) or values.before is not None)
-        self._name.props["placeholder"] = self._default_name()
+        self._name.props["placeholder"] = self._suggest_name()
         self._name.update()
 
-    def _default_name(self) -> str:
+    def _suggest_name(self) -> str:
         return name_cloud(self._board.cloud_name or "profile")
 
     def _undo(self) -> None:
         self._measuring.values = self._measuring.values.undo()
 
     async def _save(self) -> None:
-        name = (self._name.value or "").strip() or self._default_name()
+        name = (self._name.value or "").strip() or self._suggest_name()
         page = new_path(self._folder, f"{name}{MEASURED_ENDINGS[0]}", suffix=MEASURED_ENDINGS[0])
         values, overwrite = self._measuring.values, bool(self._replace.value)
         title = f"Measured values of {name}"

@@ -154,14 +154,14 @@ class _Desk:
         def closer(low: np.ndarray, high: np.ndarray) -> np.ndarray:
             inside = np.flatnonzero(np.all((cloud.points_mm >= low) & (cloud.points_mm <= high), axis=1))
             found = cloud.select(inside[:: -(-len(inside) // _MOST_SHOWN) or 1])
-            return point_table(found.points_mm, **_fields(found))
+            return point_table(found.points_mm, **_choose_fields(found))
 
         self.measuring.open(cloud)
         self.board.detail = None
         self.board.cloud.clear()
         self.board.cloud_name, self.board.deviates = name, cloud.deviation_mm is not None
         shown, total = cloud.select(slice(None, None, -(-len(cloud) // _MOST_SHOWN) or 1)), of or len(cloud)
-        self.board.cloud.add(shown.points_mm, total, **_fields(shown))
+        self.board.cloud.add(shown.points_mm, total, **_choose_fields(shown))
         self.board.detail = closer if total > len(shown) else None
 
     def open_cloud(self, name: str) -> None:
@@ -182,7 +182,7 @@ class _Desk:
             self.board.say(str(error), "error")
 
 
-def _fields(cloud: PointCloud) -> dict[str, np.ndarray | None]:
+def _choose_fields(cloud: PointCloud) -> dict[str, np.ndarray | None]:
     """Return fields (N,) for colouring a cloud's points."""
     return {field: cloud.field_values(field) for field in FIELDS}
 
@@ -209,10 +209,10 @@ class _OperatorPage:
             with ui.element("section").classes("tools").props('aria-label="controls"'):
                 parts = {
                     "Connect": self._connect_part,
-                    "Stage": self._stage_part,
-                    "Calibrate": self._calibrate_part,
+                    "Stage": self._show_stage_part,
+                    "Calibrate": self._show_calibrate_part,
                     "Scan": self._scan_part,
-                    "Files": self._files_part,
+                    "Files": self._show_files_part,
                     "Inspect": self._analyses.build,
                     "Measure": self._measure.build,
                 }
@@ -254,7 +254,7 @@ class _OperatorPage:
         self._analyses.refresh()
         self._measure.refresh()
         self._light.value = self._instrument.light or "none"
-        if (shown := self._exposure_now()) != self._exposed:
+        if (shown := self._read_exposure()) != self._exposed:
             # Not while the operator types in it.
             self._exposed, self._exposure.value = shown, shown[1]
         # A new page is refreshed twice before its buttons are enabled: text typed before the connection arrives a
@@ -271,7 +271,7 @@ class _OperatorPage:
         chosen = None if self._desk.plan_path is None else str(self._desk.plan_path)
         # Here and below, values are passed to the constructors: a value set later reaches the browser as a message, and
         # could overwrite what the operator has typed by then.
-        camera, stage = _addresses(plan) if plan else ("", "")
+        camera, stage = _read_addresses(plan) if plan else ("", "")
         self._plan = ui.select(plans, label="plan of the scan", value=chosen, on_change=self._choose).classes("w-full")
         kinds = "gige:NAME, replay:FILE"
         self._camera = ui.input("camera", value=camera, placeholder=kinds).classes("w-full")
@@ -284,7 +284,7 @@ class _OperatorPage:
         self._light = ui.toggle({"lamp": "lamp", "laser": "laser", "none": "stop"}, value="none")
         self._light.on_value_change(lambda event: self._look(event.value))
         self._only.append((self._light, _FREE))
-        self._exposed = self._exposure_now()
+        self._exposed = self._read_exposure()
         with ui.element("div").classes("fields"):
             self._exposure = NumberField("exposure, ms", value=self._exposed[1], min=0.001, step=0.1, format="%.3g")
             self._exposure.on("change", self._expose)
@@ -300,7 +300,7 @@ class _OperatorPage:
             self._board.say(str(error), "error")
             return
         self._desk.plan_path, self._desk.plan = Path(self._plan.value), plan
-        self._camera.value, self._stage.value = _addresses(plan)
+        self._camera.value, self._stage.value = _read_addresses(plan)
         stage = plan.stage
         self._start.value, self._step.value, self._number.value = stage.start_mm, stage.step_mm, stage.count
 
@@ -319,7 +319,7 @@ class _OperatorPage:
         if wanted != self._instrument.light:
             self._instrument.show_light(wanted)
 
-    def _exposure_now(self) -> tuple[str | None, float]:
+    def _read_exposure(self) -> tuple[str | None, float]:
         light = self._instrument.light
         return light, self._instrument.exposure_ms[light or "lamp"]
 
@@ -330,7 +330,7 @@ class _OperatorPage:
 
     # Stage
 
-    def _stage_part(self) -> None:
+    def _show_stage_part(self) -> None:
         device, ask = self._instrument, self._instrument.ask
         with ui.row():
             self._button("home", partial(ask, device.home), _FREE)
@@ -348,7 +348,7 @@ class _OperatorPage:
 
     # Calibrate
 
-    def _calibrate_part(self) -> None:
+    def _show_calibrate_part(self) -> None:
         self._guided_plan = ui.select(self._desk.plans(load_guided_plan), label="plan of the calibration").classes(
             "w-full"
         )
@@ -441,7 +441,7 @@ class _OperatorPage:
 
     # Files
 
-    def _files_part(self) -> None:
+    def _show_files_part(self) -> None:
         self._rows = ui.column().classes("w-full gap-1")
         self._update_list()
 
@@ -480,13 +480,13 @@ class _OperatorPage:
                         self._button("list", partial(self._measure.open, name)).props("flat dense")
                     if file.kind == "capture":
                         self._button("reconstruct", partial(self._reconstruct, name)).props("flat dense")
-                    self._button("about", partial(self._about, name)).props("flat dense")
+                    self._button("about", partial(self._show_about, name)).props("flat dense")
 
     async def _show(self, name: str) -> None:
         await asyncio.to_thread(self._desk.open_cloud, name)
         self._view.mark([])
 
-    async def _about(self, name: str) -> None:
+    async def _show_about(self, name: str) -> None:
         text = await asyncio.to_thread(describe, find_file(self._desk.folder, name))
         with ui.dialog() as dialog, ui.card().classes("max-w-none"):
             ui.label(name).classes("font-bold")
@@ -503,6 +503,6 @@ class _OperatorPage:
         self._tabs.set_value("Inspect")
 
 
-def _addresses(plan: ScanPlan) -> tuple[str, str]:
+def _read_addresses(plan: ScanPlan) -> tuple[str, str]:
     """Return the addresses of the camera and the stage."""
     return plan.camera or "", plan.stage.port or ""

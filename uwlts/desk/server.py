@@ -36,7 +36,7 @@ _ALONE = threading.Lock()
 
 
 @cache
-def _nicegui() -> FastAPI:
+def _start_nicegui() -> FastAPI:
     """Return the only NiceGUI application of the process; ``state.show`` builds its present page."""
     app = FastAPI(**_NO_PAGES)
 
@@ -69,7 +69,7 @@ class DeskServer:
         port: int = 8080,
         switch: LaserSwitch | None = None,
     ):
-        self._access, nicegui, self._switch = PageAccess(host), _nicegui(), switch
+        self._access, nicegui, self._switch = PageAccess(host), _start_nicegui(), switch
         self.app = FastAPI(**_NO_PAGES, lifespan=nicegui.router.lifespan_context)
         self._add_content(board)
         # Handles all requests that no other route matches.
@@ -154,7 +154,7 @@ class DeskServer:
 
         @self.app.get("/cloud")
         def cloud() -> Response:
-            return _cloud_answer(board.cloud.points())
+            return _answer_with_cloud(board.cloud.points())
 
         @self.app.get("/cloud/detail")
         def detail(box: str) -> Response:
@@ -163,7 +163,7 @@ class DeskServer:
                 low, high = np.array(box.split(","), dtype=float).reshape(2, 3)
                 if look is not None and np.isfinite([low, high]).all() and (low < high).all():
                     table = look(low, high)
-            return Response(b"", 204, _LATEST) if table is None else _cloud_answer(table)
+            return Response(b"", 204, _LATEST) if table is None else _answer_with_cloud(table)
 
     def is_operator(self, request: Request) -> bool:
         """Return whether a request is the operator's."""
@@ -191,7 +191,7 @@ class DeskServer:
         self.close()
 
 
-def _cloud_answer(table: np.ndarray) -> Response:
+def _answer_with_cloud(table: np.ndarray) -> Response:
     """Return points (N, 7) as a response to the browser."""
     origin, data = pack(table)
     headers = _LATEST | {"X-Origin": ",".join(map(str, origin.tolist()))}

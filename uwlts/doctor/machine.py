@@ -296,18 +296,18 @@ def judge_settings(settings: Mapping[int, float]) -> list[Finding]:
     findings = []
     if unsafe:
         found = "; ".join(f"{now[n]}, not {wanted} ({BEHAVIOUR[n][1]})" for n, wanted in unsafe.items())
-        advice = f"send, one line each, what docs/how-to/hardware-stage.md asks for: {_lines(unsafe)}"
+        advice = f"send, one line each, what docs/how-to/hardware-stage.md asks for: {_format_settings(unsafe)}"
         if {20, 22} & unsafe.keys():
             advice += "\n$20=0 and $22=0 are right for a stage without a limit switch"
         findings.append(Finding("stage settings", "warning", found, advice))
     if other:
         found = f"other than the thesis's bench: {', '.join(now[n] for n in other)}"
-        advice = f"right if your mechanics are other ones; for the thesis's bench send {_lines(other)}"
+        advice = f"right if your mechanics are other ones; for the thesis's bench send {_format_settings(other)}"
         findings.append(Finding("stage mechanics", "warning", found, advice))
     return findings or [Finding("stage settings", "ok", "as docs/how-to/hardware-stage.md asks for")]
 
 
-def _lines(wanted: Mapping[int, float]) -> str:
+def _format_settings(wanted: Mapping[int, float]) -> str:
     return " ".join(f"${number}={value:g}" for number, value in wanted.items())
 
 

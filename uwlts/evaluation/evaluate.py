@@ -187,7 +187,7 @@ def _name_other_scene(header: TruthHeader, path: Path, metadata: Table) -> str |
     if (digest := metadata.get("scene")) is not None:
         found = scene_digest(header.scene)
         return None if found == digest else f"its scene has the digest {found}, the scene of {capture} has {digest}"
-    stated, wanted = _kind_of_artefact(header.scene), _kind_of_artefact(metadata)
+    stated, wanted = _read_kind(header.scene), _read_kind(metadata)
     if stated is not None and wanted is not None and stated != wanted:
         return f"it shows the artefact '{stated}', the cloud '{wanted}'"
     stated, wanted = header.scene.get("medium"), metadata.get("medium")
@@ -199,7 +199,7 @@ def _name_other_scene(header: TruthHeader, path: Path, metadata: Table) -> str |
     return None
 
 
-def _kind_of_artefact(described: Table) -> object:
+def _read_kind(described: Table) -> object:
     artefact = described.get("artefact")
     return artefact.get("kind") if isinstance(artefact, dict) else None
 

@@ -136,7 +136,7 @@ def figure_keys(artefact: Artefact) -> tuple[FigureKey, ...]:
     errors, plain = [], ()
     match artefact:
         case SphereStandard():
-            return _sphere_keys(artefact)
+            return _list_sphere_keys(artefact)
         case PlaneStandard():
             plain = Quantity.RANGE_ERROR, Quantity.STD
         case StepStandard():
@@ -151,7 +151,7 @@ def figure_keys(artefact: Artefact) -> tuple[FigureKey, ...]:
     return tuple(FigureKey(quantity, str(quantity), calibrated=known) for quantity, known in with_errors)
 
 
-def _sphere_keys(artefact: SphereStandard) -> tuple[FigureKey, ...]:
+def _list_sphere_keys(artefact: SphereStandard) -> tuple[FigureKey, ...]:
     keys = [FigureKey(quantity, str(quantity)) for quantity in (Quantity.PROBING_ERROR, Quantity.STD)]
     for number, diameter in enumerate(artefact.diameters_mm, start=1):
         known = CalibratedQuantity(f"diameter, sphere {number}", diameter, artefact.diameter_uncertainty_mm)

@@ -131,7 +131,7 @@ def describe_differences(there: object, now: object) -> str:
 
     ``there`` is the content of a file, ``now`` the wanted one.
     """
-    found = [f"{entry} is {_brief(old)} in it, {_brief(new)} now" for entry, old, new in _different(there, now, "")]
+    found = [f"{entry} is {_shorten(old)} in it, {_shorten(new)} now" for entry, old, new in _different(there, now, "")]
     more = [f"and {len(found) - _SHOWN} more"] if len(found) > _SHOWN else []
     return "; ".join(found[:_SHOWN] + more)
 
@@ -152,7 +152,7 @@ def _different(there: object, now: object, entry: str) -> Iterator[tuple[str, ob
         yield entry, there, now
 
 
-def _brief(value: object) -> str:
+def _shorten(value: object) -> str:
     text = "not stated" if value is None else json.dumps(value, ensure_ascii=False)
     return text if len(text) <= _BRIEF else f"{text[:_BRIEF]}..."
 

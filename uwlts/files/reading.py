@@ -162,7 +162,7 @@ def parse_json(text: str) -> "JsonValue":
     if text.count(",") + text.count("[") + text.count("{") > MOST_VALUES:
         raise ValueError(f"it holds more than {MOST_VALUES:,} values")
     try:
-        content = json.loads(text, object_pairs_hook=_unique)
+        content = json.loads(text, object_pairs_hook=_require_unique)
     except RecursionError as error:
         raise json.JSONDecodeError(_TOO_DEEP, text, 0) from error
     return require_plain(content)
@@ -230,7 +230,7 @@ def find_not_finite(content: object) -> str:
     return ""
 
 
-def _unique(pairs: "list[tuple[str, JsonValue]]") -> "dict[str, JsonValue]":
+def _require_unique(pairs: "list[tuple[str, JsonValue]]") -> "dict[str, JsonValue]":
     table = dict(pairs)
     if len(table) < len(pairs):
         counts = Counter(key for key, _ in pairs)

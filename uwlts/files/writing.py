@@ -66,7 +66,7 @@ def name_write_errors(target: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise OutputError(_cannot_write(target, error)) from error
+        raise OutputError(_describe_failure(target, error)) from error
 
 
 def remove_incomplete() -> None:
@@ -107,12 +107,12 @@ def require_possible_name(target: Path) -> None:
     except (FileNotFoundError, NotADirectoryError):
         pass
     except OSError as error:
-        raise OutputError(_cannot_write(target, error)) from error
+        raise OutputError(_describe_failure(target, error)) from error
     except ValueError as error:
         raise OutputError(f"cannot write {str(target)!r}: no file can have this name") from error
 
 
-def _cannot_write(target: Path, error: OSError) -> str:
+def _describe_failure(target: Path, error: OSError) -> str:
     advice = {
         errno.ENOSPC: "the disk is full; free some space",
         errno.EDQUOT: "the disk quota is used up; free some space",

@@ -136,7 +136,7 @@ def surface_patches(
     middle, discs = middle[enough], discs[enough]
     if not len(middle):
         raise EvaluationError(f"no disc of {radius:.3g} mm radius contains enough points: the cloud is too sparse")
-    axes = _principal_frames(discs.about_mm, discs.weight)
+    axes = _find_principal_frames(discs.about_mm, discs.weight)
     fit = _fit_discs(discs, axes, radius)
     variance = fit.point_variance
     kept = variance <= _ROUGH**2 * max(np.median(variance), 1e-30)
@@ -159,7 +159,7 @@ def surface_patches(
     signs = sign[:, None] ** np.array([1, 1, 2, 1, 2, 1])
     shape = shape * signs
     covariance = covariance * np.outer(units, units) * signs[:, :, None] * signs[:, None]
-    images = _image_errors(uncertainty if grouped else None, frame, owner, first)
+    images = _compute_image_errors(uncertainty if grouped else None, frame, owner, first)
     errors = PatchErrors(discs.near, fit.heights, radius * np.sqrt(noise), axes[:, 2], counts, *images)
     chosen = np.flatnonzero(kept)
     chosen = chosen[:: max(1, -(-len(chosen) // _MOST))]
@@ -224,7 +224,7 @@ def _fit_discs(discs: _Discs, axes: np.ndarray, radius: float) -> _DiscFit:
     """Fit second-order surfaces to the averages in discs, over the tangents of ``axes`` (P, 3, 3)."""
     weight = discs.weight
     u, v, w = np.einsum("pij,pkj->ipk", axes, discs.about_mm) / radius
-    columns = _columns(u, v)
+    columns = _compute_terms(u, v)
     weighted = weight[:, :, None] * columns
     normal = weighted.transpose(0, 2, 1) @ columns
     # Points on a line leave second-order terms undetermined. A ridge of 1e-6 of the total weight sets these to zero.
@@ -303,7 +303,7 @@ def distances_between(
     nearest = found[1][rows]
     u, v, w = np.einsum("qij,qj->iq", target.axes[nearest], local[rows] - target.places_mm[nearest])
     shape = target.shape[nearest]
-    columns = _columns(u, v)
+    columns = _compute_terms(u, v)
     slopes = np.stack(
         [shape[:, 1] + 2 * shape[:, 3] * u + shape[:, 4] * v, shape[:, 2] + shape[:, 4] * u + 2 * shape[:, 5] * v]
     )
@@ -407,7 +407,7 @@ def decompose_motions(
     return values, vectors, metric
 
 
-def _columns(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+def _compute_terms(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Return the terms (..., 6) of a second-order surface."""
     return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
 
@@ -432,7 +432,7 @@ def _select_central(points: np.ndarray, spacing: float) -> np.ndarray:
     return np.sort(order[np.r_[True, np.any(np.diff(cells[order], axis=0), axis=1)]])
 
 
-def _principal_frames(about: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def _find_principal_frames(about: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return right-handed principal axes (rows of (P, 3, 3)) of weighted points (P, K, 3), the normal last."""
     middle = np.einsum("pk,pki->pi", weight, about) / weight.sum(axis=1)[:, None]
     centred = about - middle[:, None]
@@ -457,7 +457,7 @@ def _level(places: np.ndarray, axes: np.ndarray, shape: np.ndarray) -> tuple[np.
     return moved, np.stack([first, np.cross(normal, first), normal], axis=1), level
 
 
-def _image_errors(
+def _compute_image_errors(
     known: PointUncertainty | None, frame: np.ndarray | None, owner: np.ndarray, first: np.ndarray
 ) -> tuple[csr_array, np.ndarray]:
     """Return the fraction (C, I) of points of each average by image, and shifts (J, C, 3) by errors of the image."""

@@ -187,10 +187,10 @@ def _assemble(
         product, own_cost = normal_equations(parts, count, len(values), soft_limit=soft_limit)
         cost += own_cost
         found.append((np.vstack([part.residuals for part in parts]), product))
-    global_scale = _column_lengths(sum((np.diag(product)[:count] for _, product in found), np.zeros(count)))
+    global_scale = _compute_column_lengths(sum((np.diag(product)[:count] for _, product in found), np.zeros(count)))
     block, gradient, groups = np.zeros((count, count)), np.zeros(count), []
     for residuals, product in found:
-        scale = _column_lengths(np.diag(product)[count:-1])
+        scale = _compute_column_lengths(np.diag(product)[count:-1])
         scaled = product / np.outer(both := np.r_[global_scale, scale, 1.0], both)
         block += scaled[:count, :count]
         gradient += scaled[:count, -1]
@@ -199,7 +199,7 @@ def _assemble(
     return _Normal(cost, block, gradient, global_scale, groups)
 
 
-def _column_lengths(squares: np.ndarray) -> np.ndarray:
+def _compute_column_lengths(squares: np.ndarray) -> np.ndarray:
     return np.where(squares > 0, np.sqrt(squares), 1.0)
 
 

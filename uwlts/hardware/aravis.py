@@ -114,7 +114,7 @@ def _load_functions() -> SimpleNamespace:
     return functions
 
 
-def _text(value: bytes | None) -> str:
+def _decode(value: bytes | None) -> str:
     return "" if value is None else value.decode(errors="replace")
 
 
@@ -148,7 +148,7 @@ def list_aravis_cameras() -> list[FoundCamera]:
     functions.arv_update_device_list()
     asked = [getattr(functions, f"arv_get_device_{part}") for part in ("id", "serial_nbr", "address", "protocol")]
     count = functions.arv_get_n_devices()
-    return _find_on_loopback() + [FoundCamera(*(_text(ask(k)) for ask in asked)) for k in range(count)]
+    return _find_on_loopback() + [FoundCamera(*(_decode(ask(k)) for ask in asked)) for k in range(count)]
 
 
 def _find_on_loopback() -> list[FoundCamera]:
@@ -187,47 +187,47 @@ class AravisCamera(CameraDevice):
     def _open(self) -> CameraInfo:
         self._functions = functions = _load_functions()
         self._gone = False
-        self._camera = self._call("new", self._identifier())
+        self._camera = self._call("new", self._find_identifier())
         try:
             # A GigE camera obeys one program at a time; Aravis opens a camera of another program for reading.
             if functions.arv_camera_is_gv_device(self._camera) and not self._take_control():
                 raise HardwareError(f"the camera {self.address} is used by another program: end that program first")
-            width, height = self._numbers("get_sensor_size", 2)
+            width, height = self._read_numbers("get_sensor_size", 2)
             maker, model, serial = (
-                _text(self._call(f"get_{part}")) or "?"
+                _decode(self._call(f"get_{part}")) or "?"
                 for part in ("vendor_name", "model_name", "device_serial_number")
             )
-            coordinates = self._coordinates() if self._pixel_format() == CENTRE_LINES else None
-            bits = _MONO_BITS.get(self._pixel_format(), 8) if coordinates is None else _COORDINATE_BITS
-            black = self._feature("BlackLevel", float)
+            coordinates = self._read_coordinates() if self._read_pixel_format() == CENTRE_LINES else None
+            bits = _MONO_BITS.get(self._read_pixel_format(), 8) if coordinates is None else _COORDINATE_BITS
+            black = self._read_feature("BlackLevel", float)
         except BaseException:
             self._close()
             raise
         return CameraInfo(f"{maker} {model}", serial, width, height, bits, coordinates, black)
 
-    def _coordinates(self) -> Coordinates:
+    def _read_coordinates(self) -> Coordinates:
         """Return the encoding of a 3D camera's values; raises HardwareError if they are not px of its image sensor."""
-        mode = self._feature("Scan3dOutputMode", str)
+        mode = self._read_feature("Scan3dOutputMode", str)
         if mode is not None and not mode.startswith("Uncalibrated"):
             raise HardwareError(
                 f"the 3D camera {self.address} gives {mode}, which is not in pixels of its image sensor: set its "
                 "Scan3dOutputMode to UncalibratedC, and calibrate it with `uwlts calibrate`"
             )
-        scale, offset = (self._feature(f"Scan3dCoordinate{name}", float) for name in ("Scale", "Offset"))
-        marked = self._feature("Scan3dInvalidDataFlag", bool)
-        invalid = self._feature("Scan3dInvalidDataValue", float) if marked else None
+        scale, offset = (self._read_feature(f"Scan3dCoordinate{name}", float) for name in ("Scale", "Offset"))
+        marked = self._read_feature("Scan3dInvalidDataFlag", bool)
+        invalid = self._read_feature("Scan3dInvalidDataValue", float) if marked else None
         return Coordinates(1.0 if scale is None else scale, offset or 0.0, invalid)
 
-    def _feature(self, name: str, kind: type[str] | type[float] | type[int]) -> Any:
+    def _read_feature(self, name: str, kind: type[str] | type[float] | type[int]) -> Any:
         """Return the value of a camera feature, or None if the camera does not have it."""
         if not self._offers(name):
             return None
         value = self._call(f"get_{_KINDS[kind]}", name.encode())
-        return _text(value) if kind is str else value
+        return _decode(value) if kind is str else value
 
     def _set_plain(self) -> None:
         """Switch off what mirrors, bins or bends the images; a calibration is for images without it."""
-        found = {name: self._feature(name, type(plain)) for name, plain in _PLAIN.items()}
+        found = {name: self._read_feature(name, type(plain)) for name, plain in _PLAIN.items()}
         if found["GammaEnable"] is not None:
             # Then Gamma has no effect, and is often locked.
             found["Gamma"] = None
@@ -236,7 +236,7 @@ class AravisCamera(CameraDevice):
             plain = _PLAIN[name]
             with suppress(HardwareError):
                 self._call(f"set_{_KINDS[type(plain)]}", name.encode(), plain)
-            if self._feature(name, type(plain)) != plain:
+            if self._read_feature(name, type(plain)) != plain:
                 raise HardwareError(
                     f"the camera {self.address} has {name} = {value:g}, and does not accept {plain:g}: change it in "
                     "the camera's own program; images must be as on the image sensor, and linear in light"
@@ -259,7 +259,7 @@ class AravisCamera(CameraDevice):
                 self._functions.g_error_free(error)
         return True
 
-    def _identifier(self) -> bytes:
+    def _find_identifier(self) -> bytes:
         """Return the name of the camera in Aravis: an IP address unchanged, or the result of a search."""
         with suppress(ValueError):
             ip_address(self._name)
@@ -324,8 +324,8 @@ class AravisCamera(CameraDevice):
         return CameraSettings(
             exposure_ms=None if exposure_us is None else 1e-3 * exposure_us,
             gain_db=gain,
-            rows=self._numbers("get_region", 4)[3],
-            bits=_MONO_BITS.get(self._pixel_format(), _COORDINATE_BITS),
+            rows=self._read_numbers("get_region", 4)[3],
+            bits=_MONO_BITS.get(self._read_pixel_format(), _COORDINATE_BITS),
             trigger=wanted.trigger,
             frame_rate_hz=rate,
         )
@@ -358,8 +358,8 @@ class AravisCamera(CameraDevice):
             return bool(self._call("is_feature_available", b"Gain"))
         return bool(self._call(f"is_{feature}_available"))
 
-    def _pixel_format(self) -> str:
-        return _text(self._call("get_pixel_format_as_string"))
+    def _read_pixel_format(self) -> str:
+        return _decode(self._call("get_pixel_format_as_string"))
 
     def _start(self) -> None:
         functions = self._functions
@@ -409,10 +409,10 @@ class AravisCamera(CameraDevice):
         pixels = (ctypes.c_ubyte * needed).from_address(start)
         image = np.frombuffer(pixels, kind).reshape(height, width).astype(kind.newbyteorder("="))
         if self.info.coordinates is None:
-            return Delivered(image, number, time_s, encoder=self._chunk(buffer, "ChunkEncoderValue", 0))
-        return self._profiles(image, number, time_s, buffer)
+            return Delivered(image, number, time_s, encoder=self._read_chunk(buffer, "ChunkEncoderValue", 0))
+        return self._read_profiles(image, number, time_s, buffer)
 
-    def _profiles(self, numbers: np.ndarray, frame_id: int, time_s: float | None, buffer: int) -> Delivered:
+    def _read_profiles(self, numbers: np.ndarray, frame_id: int, time_s: float | None, buffer: int) -> Delivered:
         """Return the frame of a 3D camera with one centre line for each row of its values (N, W).
 
         Raises HardwareError if coordinates are outside the profile lines, or the time of a row is unknown.
@@ -428,7 +428,7 @@ class AravisCamera(CameraDevice):
                 lines[row],
                 frame_id,
                 None if time_s is None else time_s + since_s[row],
-                encoder=self._chunk(buffer, "ChunkEncoderValue", row),
+                encoder=self._read_chunk(buffer, "ChunkEncoderValue", row),
             )
             for row in rows
         )
@@ -436,7 +436,7 @@ class AravisCamera(CameraDevice):
 
     def _compute_times(self, rows: range, buffer: int) -> list[float]:
         """Return the times in s of a frame's profiles since the first, from their time stamps or the profile rate."""
-        stamps = [each for row in rows if (each := self._chunk(buffer, "ChunkTimestamp", row)) is not None]
+        stamps = [each for row in rows if (each := self._read_chunk(buffer, "ChunkTimestamp", row)) is not None]
         # Some cameras have only one time stamp per frame.
         if len(stamps) == len(rows) and stamps[-1] > stamps[0]:
             return [1e-9 * (each - stamps[0]) for each in stamps]
@@ -447,7 +447,7 @@ class AravisCamera(CameraDevice):
             )
         return [row / rate_hz for row in rows]
 
-    def _chunk(self, buffer: int, feature: str, row: int) -> int | None:
+    def _read_chunk(self, buffer: int, feature: str, row: int) -> int | None:
         """Return the chunk value that came with a frame, or with one of its profiles, or None."""
         functions = self._functions
         if feature.removeprefix("Chunk") not in self._chunks or not functions.arv_buffer_has_chunks(buffer):
@@ -461,9 +461,9 @@ class AravisCamera(CameraDevice):
         return None
 
     def _answers(self) -> None:
-        self._numbers("get_region", 4)
+        self._read_numbers("get_region", 4)
 
-    def _numbers(self, name: str, count: int) -> list[int]:
+    def _read_numbers(self, name: str, count: int) -> list[int]:
         numbers = [c_int() for _ in range(count)]
         self._call(name, *map(byref, numbers))
         return [number.value for number in numbers]
@@ -473,7 +473,7 @@ class AravisCamera(CameraDevice):
         receiver, error = () if self._camera is None else (self._camera,), POINTER(_GError)()
         result = getattr(self._functions, f"arv_camera_{name}")(*receiver, *arguments, byref(error))
         if error:
-            complaint = _text(error.contents.message)
+            complaint = _decode(error.contents.message)
             self._functions.g_error_free(error)
             self._gone = self._gone or "timeout" in complaint
             raise HardwareError(

@@ -76,7 +76,7 @@ def plan_passes(plan: ScanPlan, continuous: Continuous, stage: GrblStage) -> lis
         )
     positions = plan.stage.positions_mm()
     ahead = 1.0 if positions[-1] >= positions[0] else -1.0
-    ramp = _ramp_mm(speed, stage) + _SPARE_MM + _SPARE_S * speed
+    ramp = _compute_ramp_mm(speed, stage) + _SPARE_MM + _SPARE_S * speed
     first, last = positions[0] - ahead * ramp, positions[-1] + ahead * ramp
     low, high = stage.limits_mm
     if min(first, last) < low or max(first, last) > high:
@@ -87,7 +87,7 @@ def plan_passes(plan: ScanPlan, continuous: Continuous, stage: GrblStage) -> lis
     return [(first, last), (last, first)] if continuous.both_ways else [(first, last)]
 
 
-def _ramp_mm(speed: float, stage: GrblStage) -> float:
+def _compute_ramp_mm(speed: float, stage: GrblStage) -> float:
     """Return the acceleration distance in mm to a speed in mm/s."""
     return speed**2 / (2 * stage.settings.acceleration_mm_per_s2)
 
@@ -168,7 +168,7 @@ def record_continuously(
         if lost := camera.counts.dropped + camera.counts.short:
             warn(f"{lost} frames were lost between camera and computer: the steps there are larger")
         ends = sorted(passes[0])
-        ramp = _ramp_mm(continuous.speed_mm_per_s, stage)
+        ramp = _compute_ramp_mm(continuous.speed_mm_per_s, stage)
         return reader.assign_positions(continuous, (ends[0] + ramp, ends[1] - ramp), (at_rest_mm, encoder), warn)
 
 

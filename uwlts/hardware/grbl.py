@@ -97,7 +97,7 @@ class GrblAxis(GrblLine):
 
     def position_mm(self) -> float:
         """Position in mm as the controller counts it."""
-        return self._position_of(self.status())
+        return self._read_position(self.status())
 
     def _go(self, position_mm: float, feed_mm_per_min: float) -> None:
         self.command(f"G21G90G94G53G1X{self._origin_mm + position_mm:.4f}F{feed_mm_per_min:.2f}")
@@ -120,7 +120,7 @@ class GrblAxis(GrblLine):
             )
         return reached_mm
 
-    def _motion_watch(self, start_mm: float, feed_mm_s: float) -> Callable[[Status], None]:
+    def _make_motion_watch(self, start_mm: float, feed_mm_s: float) -> Callable[[Status], None]:
         """Return a check of status reports during a movement, for a stall and for states that never end."""
         last_mm, since = start_mm, time.monotonic()
         patience_s = _STALL_S + _STALL_STEPS / self.settings.steps_per_mm / feed_mm_s
@@ -128,7 +128,7 @@ class GrblAxis(GrblLine):
         def check(report: Status) -> None:
             nonlocal last_mm, since
             self._refuse_stop(report)
-            position_mm, now = self._position_of(report), time.monotonic()
+            position_mm, now = self._read_position(report), time.monotonic()
             if report.state != "Run" or not math.isclose(position_mm, last_mm, abs_tol=1e-9):
                 last_mm, since = position_mm, now
             elif now - since > patience_s:
@@ -149,9 +149,9 @@ class GrblAxis(GrblLine):
                     f"the controller is in the state {report.state} although its movements are done"
                 )
             time.sleep(POLL_S / 5)
-        return self._position_of(report)
+        return self._read_position(report)
 
-    def _position_of(self, report: Status) -> float:
+    def _read_position(self, report: Status) -> float:
         for _ in range(_REPORTS_TO_OFFSET):
             machine_mm = report.machine_mm
             if machine_mm is None and report.work_mm is not None and self.offset_mm is not None:
@@ -177,7 +177,7 @@ class GrblAxis(GrblLine):
             raise self.stop_and_make_error(f"the controller has stopped: {advice[report.state]}")
         if not self.settings.homing or "X" not in report.pins:
             return
-        position_mm = self._position_of(report)
+        position_mm = self._read_position(report)
         switch_mm = 0.0 if self.settings.homes_to_negative else self.settings.travel_mm
         if abs(position_mm - switch_mm) > self.settings.homing_pull_off_mm + _PIN_MARGIN_MM:
             raise self.stop_and_make_error(
@@ -185,7 +185,7 @@ class GrblAxis(GrblLine):
                 "the motor lost steps (feed or acceleration too high, or an obstacle); home"
             )
 
-    def _speed_of(self, power: float) -> int:
+    def _convert_power(self, power: float) -> int:
         """Return the S word for a power; raises RangeError or HardwareError if it cannot be set."""
         if not 0 < power <= 1:
             raise RangeError(f"the laser's power is {power:g}; expected above 0 and up to 1")
@@ -281,7 +281,7 @@ class GrblStage(GrblAxis):
         """
         start_mm = self._start_of(position_mm, feed_mm_per_min)
         self._go(position_mm, feed_mm_per_min)
-        watch = self._motion_watch(start_mm, feed_mm_per_min / 60)
+        watch = self._make_motion_watch(start_mm, feed_mm_per_min / 60)
         return self._arrive(position_mm, position_mm - start_mm, feed_mm_per_min, watch)
 
     def sweep(
@@ -301,7 +301,7 @@ class GrblStage(GrblAxis):
         Raises RangeError and HardwareError like `move_to` and `laser`. Also raises HardwareError if the next part was
         sent too late for a constant speed.
         """
-        speed = self._speed_of(power)
+        speed = self._convert_power(power)
         start_mm, feed_mm_s = self._start_of(position_mm, feed_mm_per_min), feed_mm_per_min / 60
         if feed_mm_s > (fastest := self.fastest_sweep_mm_per_s):
             raise RangeError(
@@ -312,12 +312,12 @@ class GrblStage(GrblAxis):
         ahead_mm = math.copysign(feed_mm_s * (_SWEEP_S - ramp_s), position_mm - start_mm)
         at_mm = sent_mm = start_mm
         brightest = 0.0
-        in_motion = self._motion_watch(start_mm, feed_mm_s)
+        in_motion = self._make_motion_watch(start_mm, feed_mm_s)
 
         def hear(report: Status) -> None:
             nonlocal at_mm, brightest
             in_motion(report)
-            at_mm = self._position_of(report)
+            at_mm = self._read_position(report)
             brightest = max(brightest, speed if report.spindle is None else report.spindle)
             reported(StageReport(self.asked_s, self.answered_s, at_mm))
 
@@ -389,7 +389,7 @@ class GrblStage(GrblAxis):
         Raises RangeError if the power is out of range. Raises HardwareError if the controller is locked or does not
         follow, the guard process is gone or has switched the laser off, or another fault occurred.
         """
-        speed = self._speed_of(power)
+        speed = self._convert_power(power)
         # A fault has already switched it off.
         if self.fault is not None and not on:
             return

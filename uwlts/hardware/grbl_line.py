@@ -256,7 +256,7 @@ class GrblLine:
         try:
             self._hang_up_on_close()
             self._guard = Heartbeat(self._serial.fileno())
-            self.version = self._greeting(boot_s)
+            self.version = self._await_greeting(boot_s)
             self._discard_replies()
         except BaseException as error:
             self.close(error)
@@ -303,7 +303,7 @@ class GrblLine:
                     "stage again"
                 )
 
-    def _greeting(self, boot_s: float) -> str:
+    def _await_greeting(self, boot_s: float) -> str:
         heard = ""
         for wait_s, wake in ((boot_s, b""), (_WAKE_S, SOFT_RESET)):
             if wake:

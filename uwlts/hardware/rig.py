@@ -221,7 +221,7 @@ class Rig:
     def move_to(self, position_mm: float) -> float:
         """Move with the laser off, let the stage settle, and return the position read back in mm."""
         if self._position_mm is None or abs(self._position_mm - position_mm) > 1e-9:
-            self._laser(False)
+            self._switch_laser(False)
             if (position_mm - self._read_back_mm) * self._ahead < 0:
                 run_up_mm = float(np.clip(position_mm - self._ahead * _RUN_UP_MM, *self._stage.limits_mm))
                 self._stage.move_to(run_up_mm, feed_mm_per_min=self._feed_mm_per_min)
@@ -250,7 +250,7 @@ class Rig:
             start_ms=start_ms,
         )
 
-    def _laser(self, on: bool) -> None:
+    def _switch_laser(self, on: bool) -> None:
         if (self._stage.laser_power > 0) != on:
             longest_s = 1e-3 * (self._exposure_ms or 0.0) + _LIGHT_S
             self._stage.laser(on, power=self._plan.laser_power, at_most_s=longest_s)
@@ -258,16 +258,16 @@ class Rig:
     def _rest(self) -> None:
         """Switch the laser off; an operator is asked only before an image without laser."""
         if not isinstance(self._stage, HandSwitchedLaser):
-            self._laser(False)
+            self._switch_laser(False)
 
     def _grab(self, light: Light) -> GrabbedFrame:
         """Take one frame, repeated if it is lost, as the stage is at rest; the laser is off between attempts."""
         deadline, tries = time.monotonic() + _RETRIED_S, 0
         while True:
             tries += 1
-            self._laser(light == "laser")
+            self._switch_laser(light == "laser")
             try:
-                frame = self._one()
+                frame = self._take_one()
             except HardwareError as error:
                 # Switch off first: closing a camera that is gone takes time.
                 with suppress(HardwareError):
@@ -283,7 +283,7 @@ class Rig:
                 self._rest()
                 return frame
 
-    def _one(self) -> GrabbedFrame:
+    def _take_one(self) -> GrabbedFrame:
         """Trigger and wait; every step sends a beat to the laser guard, in case a driver hangs."""
         exposure_s = 1e-3 * (self._exposure_ms or 0.0)
         lit, lit_until_s = self._stage.laser_power > 0, self._stage.lit_until_s

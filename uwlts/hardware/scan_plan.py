@@ -20,7 +20,7 @@ from uwlts.targets import parse_target
 Light = Literal["laser", "lamp"]
 
 
-def _unit(value: Vector) -> Vector:
+def _normalise(value: Vector) -> Vector:
     length = float(np.linalg.norm(value))
     if length < 1e-9:
         raise ValueError(f"direction {value} has no length")
@@ -28,7 +28,7 @@ def _unit(value: Vector) -> Vector:
     return x / length, y / length, z / length
 
 
-Direction = Annotated[Vector, AfterValidator(_unit)]  # vector normalised to a unit vector
+Direction = Annotated[Vector, AfterValidator(_normalise)]  # vector normalised to a unit vector
 
 
 class StageSettings(Description):

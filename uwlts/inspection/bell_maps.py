@@ -112,14 +112,14 @@ class UnrolledSurface:
         for sign, points in ((1.0, np.flatnonzero(counted > before)), (-1.0, np.flatnonzero(before > counted))):
             if len(points):
                 weight = sign * np.square(self.usual_std / self.std[points])
-                flat = np.ravel_multi_index(_cells_of(self.places[points], origin, cell, shape), shape)
+                flat = np.ravel_multi_index(_find_cells(self.places[points], origin, cell, shape), shape)
                 mass = mass + np.bincount(flat, weight, mass.size).reshape(shape)
                 load = load + np.bincount(flat, weight * self.heights[points], mass.size).reshape(shape)
         self._cell_sums[cell] = counted.copy(), mass, load
         return mass, load
 
 
-def _cells_of(
+def _find_cells(
     places: np.ndarray, origin: np.ndarray, cell: float, shape: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the row and the column (N,) of the cell nearest to each place (N, 2), on a grid with a given corner."""
@@ -215,11 +215,11 @@ class BellMap:
         """Return the standard deviation (N,) of a bell's height at places."""
         with np.errstate(invalid="ignore", divide="ignore"):
             level = np.where(np.isfinite(self.z), self.spread / np.sqrt(self.information), np.nan)
-        return level[_cells_of(places, self.origin, self.cell, level.shape)]
+        return level[_find_cells(places, self.origin, self.cell, level.shape)]
 
     def noise_at(self, places: np.ndarray) -> np.ndarray:
         """Return the effective standard deviation (N,) of a point of unit weight at places."""
-        return self.spread[_cells_of(places, self.origin, self.cell, self.spread.shape)]
+        return self.spread[_find_cells(places, self.origin, self.cell, self.spread.shape)]
 
 
 def fit_bells(surface: UnrolledSurface, undamaged: np.ndarray, radius: float) -> BellMap:
@@ -269,7 +269,7 @@ def fit_bells(surface: UnrolledSurface, undamaged: np.ndarray, radius: float) ->
     scaled = np.where(seen, amplitude / np.sqrt(np.where(seen, information, 1.0)), np.nan)
     spread, z = _standardise(scaled, max(1, round(SEARCH_RULE.scatter_block * SEARCH_RULE.cells_per_radius)))
     height = np.where(seen, amplitude / np.where(seen, information, 1.0), np.nan)
-    moments = np.array([_spectral_moment(z, axis, cell) for axis in (0, 1)])
+    moments = np.array([_estimate_spectral_moment(z, axis, cell) for axis in (0, 1)])
     area = cell**2 * float(np.count_nonzero(seen))
     sides = cell * np.array([np.count_nonzero(seen.any(axis=1)), np.count_nonzero(seen.any(axis=0))])
     return BellMap(radius, origin, cell, height, information, spread, z, area, moments, sides)
@@ -306,15 +306,15 @@ def _standardise(values: np.ndarray, block: int) -> tuple[np.ndarray, np.ndarray
     spread = np.maximum(spread, 1e-12)
     t = (values - middle) / spread
     # A scatter from few places is uncertain: map Student's t to the normal variable of equal probability.
-    return spread, np.sign(t) * _normal_of_t(np.abs(t), freedom)
+    return spread, np.sign(t) * _convert_t_to_normal(np.abs(t), freedom)
 
 
-def _normal_of_t(t: np.ndarray | float, freedom: np.ndarray | float) -> np.ndarray:
+def _convert_t_to_normal(t: np.ndarray | float, freedom: np.ndarray | float) -> np.ndarray:
     """Return the standard normal variable of the same tail probability as Student's ``t``, which is not negative."""
     return -special.ndtri(np.clip(special.stdtr(freedom, -np.asarray(t)), 1e-300, 0.5))
 
 
-def _spectral_moment(z: np.ndarray, axis: int, cell: float) -> float:
+def _estimate_spectral_moment(z: np.ndarray, axis: int, cell: float) -> float:
     """Return the root second spectral moment, 1/mm: standard deviation of the slope of a unit-variance field."""
     step = np.diff(z, axis=axis)
     step = step[np.isfinite(step)]
@@ -351,7 +351,7 @@ class Tail:
 
     def normalise(self, strength: float) -> float:
         """Return the standard normal variable of equal probability for a height in robust standard deviations."""
-        return float(_normal_of_t(strength / self._scale, self.freedom))
+        return float(_convert_t_to_normal(strength / self._scale, self.freedom))
 
     def scatter_at(self, z: float) -> float:
         """Return the height, in robust standard deviations, for a standard normal variable."""

@@ -341,7 +341,7 @@ class _Field:
         sides = [np.arange(a - cell, b + 2 * cell, cell) for a, b in zip(low - middle, high - middle, strict=True)]
         shape = len(sides[0]), len(sides[1])
         grid = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 2)
-        smooth = _quadratic_rows(grid, places, KDTree(places), bandwidth)
+        smooth = _make_quadratic_rows(grid, places, KDTree(places), bandwidth)
         # Beyond a border of the points quadratics would extrapolate.
         widest = float(np.max(measure_spacing(surface.places[near], np.flatnonzero(~ring))))
         region = KDTree(places[~ring]).query(grid)[0] < min(bandwidth, max(search.smallest_mm, widest))
@@ -584,7 +584,7 @@ def _interpolation_rows(places: np.ndarray, shape: tuple[int, int]) -> sparse.cs
     return sparse.csr_array((values, (rows, columns)), shape=(len(places), shape[0] * shape[1]))
 
 
-def _quadratic_rows(grid: np.ndarray, places: np.ndarray, tree: KDTree, bandwidth: float) -> sparse.csr_array:
+def _make_quadratic_rows(grid: np.ndarray, places: np.ndarray, tree: KDTree, bandwidth: float) -> sparse.csr_array:
     """Return rows (G, n) that give local quadratics at the grid's places as products with heights.
 
     Weights are Epanechnikov's. A place with fewer than nine points in the window takes the mean of the nearest three.

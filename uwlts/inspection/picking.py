@@ -95,8 +95,8 @@ def fit_shape_near(cloud: PointCloud, place_mm: np.ndarray, radius_mm: float, sh
     points, fit = cloud.points_mm[near], _FITS[shape]
     robust = fit_robustly(fit, points)
     used = near[robust.inliers]
-    figures = _figures(robust.fit)
-    stated = _state_uncertainty(cloud, used, lambda moved: _figures(fit(moved)))
+    figures = _list_figures(robust.fit)
+    stated = _state_uncertainty(cloud, used, lambda moved: _list_figures(fit(moved)))
     return PickedMeasurement(shape, figures, stated, len(used), robust.rejected)
 
 
@@ -113,7 +113,7 @@ def _state_uncertainty(
     return propagate_figures(errors, measure(points), lambda moves: measure(points + moves), draws=_DRAWS)
 
 
-def _figures(fit: Sphere | Plane | Cylinder) -> dict[str, float]:
+def _list_figures(fit: Sphere | Plane | Cylinder) -> dict[str, float]:
     form = {"standard deviation": fit.std_mm}
     return form if isinstance(fit, Plane) else {"diameter": 2 * fit.radius_mm} | form
 

@@ -125,7 +125,7 @@ def inspect_pipe(
         if np.std(after - before) > _MOVED * robust_std(after):
             search = _search_form(cloud, form, chosen, false_alarm)
     features, of_sections = pipe_features(cloud, form, section_mm=section_mm)
-    of_welds, on_welds = _weld_features(cloud, form, welds)
+    of_welds, on_welds = _make_weld_features(cloud, form, welds)
     blemishes = _Blemishes(cloud, form, chosen, search, wall_mm)
     features += [*of_welds, *blemishes.measure_all()]
     deviation, level = np.full(len(cloud), np.nan), np.full(len(cloud), np.nan)
@@ -229,7 +229,7 @@ def _unroll(
     return UnrolledSurface(places, heights, std, footprint, footprint_std)
 
 
-def _weld_features(cloud: PointCloud, form: PipeForm, welds: list[PipeWeld]) -> tuple[list[Feature], list[str]]:
+def _make_weld_features(cloud: PointCloud, form: PipeForm, welds: list[PipeWeld]) -> tuple[list[Feature], list[str]]:
     """Return the welds as features, and notes on them."""
     features, notes = [], []
     for weld in welds:
@@ -282,7 +282,7 @@ class _Blemishes:
                 self._measure(indication, indication.points, middle, partial(measure_blemish, surface, self._search))
         self._measured.sort(key=lambda each: each[0].extent_mm[2], reverse=True)
         numbers = dict.fromkeys(FeatureKind, 0)
-        found = [*map(self._sized_feature, self._measured), *map(self._unsized_feature, self._unsized)]
+        found = [*map(self._make_sized_feature, self._measured), *map(self._make_unsized_feature, self._unsized)]
         features = []
         for feature in found:
             numbers[feature.kind] += 1
@@ -356,7 +356,7 @@ class _Blemishes:
         kind = FeatureKind.PROTRUSION if height > 0 else FeatureKind.PIT
         self._unsized.append((kind, self._chosen[points], abs(height), bound, f"not sized: {reason}"))
 
-    def _sized_feature(self, measured: tuple[Blemish, float, float]) -> Feature:
+    def _make_sized_feature(self, measured: tuple[Blemish, float, float]) -> Feature:
         blemish, middle, chance = measured
         form = self._form
 
@@ -370,7 +370,7 @@ class _Blemishes:
             "",
             blemish.with_spacing(),
             in_cloud(blemish.place[None])[0],
-            self._axes(out),
+            self._find_axes(out),
             blemish.extent_mm,
             self._chosen[blemish.points],
             chance,
@@ -379,16 +379,16 @@ class _Blemishes:
             blemish.reason,
         )
 
-    def _unsized_feature(self, found: tuple[FeatureKind, np.ndarray, float, float, str]) -> Feature:
+    def _make_unsized_feature(self, found: tuple[FeatureKind, np.ndarray, float, float, str]) -> Feature:
         kind, points, height, bound, reason = found
         place = self._cloud.points_mm[points].mean(axis=0)
         out = self._form.frame.normals_at(self._form.frame.cylindrical(place[None])[1])[0]
         name = "height" if kind == FeatureKind.PROTRUSION else "depth"
         value = replace(plain_value(kind, name, max(height, bound), 0.0, None), low=bound).as_bound()
         extent = np.array([0.0, 0.0, height])
-        return Feature(kind, "", (value,), place, self._axes(out), extent, points, reason=reason)
+        return Feature(kind, "", (value,), place, self._find_axes(out), extent, points, reason=reason)
 
-    def _axes(self, out: np.ndarray) -> np.ndarray:
+    def _find_axes(self, out: np.ndarray) -> np.ndarray:
         """Return the axes (3, 3) of a feature with an outward normal (3,)."""
         along = self._form.frame.axes[2]
         return np.array([along, np.cross(out, along), out])

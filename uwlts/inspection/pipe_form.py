@@ -159,9 +159,9 @@ def _fit_from(
         along, angle, height = frame.cylindrical(points)
         off = height - radius
         near = np.abs(off - np.median(off)) < FORM_RULE.off_pipe * radius
-        arc = _arc(angle[near])
-        terms = _terms(arc)
-        design = _design(along, angle, scale, terms)
+        arc = _measure_arc(angle[near])
+        terms = _list_terms(arc)
+        design = _find_design(along, angle, scale, terms)
         rows, weight = fit_biweight(design, off, near)
         coefficients = rows @ off
         known = dict(zip(terms, coefficients, strict=True))
@@ -225,23 +225,23 @@ def pipe_features(
     for start, end in pairwise(edges):
         inside = (along >= start) & ((along < end) | (end == edges[-1]))
         members = used[inside]
-        arc, least = _arc(form.angle[members]), FORM_RULE.section_arc * min(form.arc, FORM_RULE.oval_arc)
+        arc, least = _measure_arc(form.angle[members]), FORM_RULE.section_arc * min(form.arc, FORM_RULE.oval_arc)
         if len(members) < FORM_RULE.section_points or arc < least:
             notes.append(
                 f"no section from {start:.4g} to {end:.4g} mm along the axis: {len(members)} points over "
                 f"{np.degrees(arc):.0f} deg; {FORM_RULE.section_points} over {np.degrees(least):.0f} deg are needed"
             )
             continue
-        design = _design(np.zeros(len(members)), form.angle[members], 1.0, terms)
+        design = _find_design(np.zeros(len(members)), form.angle[members], 1.0, terms)
         weights = np.linalg.pinv(design, rcond=1e-6)
         coefficients = weights @ raw[members]
         middle = form.frame.point_mm + 0.5 * (start + end) * form.frame.axes[2]
         if form.is_seen_round:
             middle = middle + coefficients[1] * form.frame.axes[0] + coefficients[2] * form.frame.axes[1]
             left = raw[members] - design @ coefficients
-            values = _section_values(form, errors[inside], weights, coefficients, left)
+            values = _make_section_values(form, errors[inside], weights, coefficients, left)
         else:
-            values = (_arc_diameter(form, errors, inside, weights[0], float(coefficients[0])),)
+            values = (_measure_arc_diameter(form, errors, inside, weights[0], float(coefficients[0])),)
         size = np.array([extent[0], extent[1], end - start])
         name = f"section {len(features)}"
         features.append(Feature(FeatureKind.SECTION, name, values, middle, form.frame.axes, size, members))
@@ -252,7 +252,7 @@ def _make_whole_values(form: PipeForm, errors: PointErrors) -> tuple[FeatureValu
     kind, used, coefficients, diameter = FeatureKind.PIPE, form.used, form.coefficients, 2 * form.radius_mm
     random, common = errors.covariances(form.weights, form.distance_mm[used], _neighbourhoods(form, used))
     if not form.is_seen_round:
-        by_ovality = form.weights @ _unseen_ovality(form, used)
+        by_ovality = form.weights @ _bound_unseen_ovality(form, used)
         common = by_ovality @ by_ovality.T + (0.0 if common is None else common)
 
     def plain(name: str, value: float, term: str, scale: float) -> FeatureValue:
@@ -289,7 +289,7 @@ def _select_covariance(
     return random[np.ix_(at, at)], None if common is None else common[np.ix_(at, at)]
 
 
-def _section_values(
+def _make_section_values(
     form: PipeForm, errors: PointErrors, weights: np.ndarray, coefficients: np.ndarray, left: np.ndarray
 ) -> tuple[FeatureValue, ...]:
     """Return the values of a section from the coefficients (5,) of `_ROUND_TERMS`, with residuals ``left`` (K,)."""
@@ -306,7 +306,7 @@ def _section_values(
     )
 
 
-def _arc_diameter(
+def _measure_arc_diameter(
     form: PipeForm, errors: PointErrors, inside: np.ndarray, weights: np.ndarray, off: float
 ) -> FeatureValue:
     """Return the diameter of a section whose points do not determine its centre.
@@ -316,17 +316,17 @@ def _arc_diameter(
     """
     moved = [form.terms.index(term) for term in ("cos", "sin", "along cos", "along sin")]
     members = form.used[inside]
-    by_axis = weights @ _design(form.along_mm[members], form.angle[members], form.scale_mm, form.terms)[:, moved]
+    by_axis = weights @ _find_design(form.along_mm[members], form.angle[members], form.scale_mm, form.terms)[:, moved]
     whole = -by_axis @ form.weights[moved]
     whole[inside] += weights
     random, common = errors.covariances(whole[None], form.distance_mm[form.used], _neighbourhoods(form, form.used))
-    by_ovality = whole @ _unseen_ovality(form, form.used)
+    by_ovality = whole @ _bound_unseen_ovality(form, form.used)
     common = np.array([[by_ovality @ by_ovality]]) + (0.0 if common is None else common)
     diameter = 2 * (form.radius_mm + off)
     return linear_value(FeatureKind.SECTION, "diameter", diameter, (random, common), np.array([2.0]))
 
 
-def _unseen_ovality(form: PipeForm, points: np.ndarray) -> np.ndarray:
+def _bound_unseen_ovality(form: PipeForm, points: np.ndarray) -> np.ndarray:
     """Return the change of the radii of points (N, 2) by one standard deviation of an unknown ovality.
 
     The ovality is uniform up to the largest one, in any direction (JCGM 100:2008, 4.3.7).
@@ -346,7 +346,7 @@ def _neighbourhoods(form: PipeForm, used: np.ndarray) -> np.ndarray:
     return row * FORM_RULE.sectors + sector
 
 
-def _terms(arc: float) -> tuple[str, ...]:
+def _list_terms(arc: float) -> tuple[str, ...]:
     terms = ["1", "cos", "sin", "along", "along cos", "along sin", "along2 cos", "along2 sin"]
     if arc >= FORM_RULE.oval_arc:
         terms += ["cos 2", "sin 2"]
@@ -355,7 +355,7 @@ def _terms(arc: float) -> tuple[str, ...]:
     return tuple(terms)
 
 
-def _design(along_mm: np.ndarray, angle: np.ndarray, scale: float, terms: tuple[str, ...]) -> np.ndarray:
+def _find_design(along_mm: np.ndarray, angle: np.ndarray, scale: float, terms: tuple[str, ...]) -> np.ndarray:
     """Return the derivatives (N, K) of the radial distance by the coefficients of the terms."""
     t = np.asarray(along_mm) / scale
     columns = []
@@ -379,11 +379,11 @@ def _evaluate_terms(
 ) -> np.ndarray:
     """Return the sum (N,) of the terms of the radial distance; derivatives would need 112 bytes a point."""
     parts = [slice(start, start + _AT_A_TIME) for start in range(0, len(along_mm), _AT_A_TIME)]
-    sums = [_design(along_mm[part], angle[part], scale, terms) @ coefficients for part in parts]
+    sums = [_find_design(along_mm[part], angle[part], scale, terms) @ coefficients for part in parts]
     return np.concatenate([np.zeros(0), *sums])
 
 
-def _arc(angle: np.ndarray) -> float:
+def _measure_arc(angle: np.ndarray) -> float:
     """Return the part of the circumference, rad, with points, in sectors of 5 deg."""
     sector = np.floor((angle + np.pi) / (2 * np.pi) * (FORM_RULE.sectors - 1e-6)).astype(int)
     return float(np.count_nonzero(np.bincount(sector, minlength=FORM_RULE.sectors)) * 2 * np.pi / FORM_RULE.sectors)

@@ -110,8 +110,8 @@ class _Cells:
         at = [np.minimum((n * p).astype(int), n - 1) for n, p in zip(shape, place, strict=True)]
         flat = at[0] * shape[1] + at[1]
         count = np.bincount(flat, minlength=shape[0] * shape[1])
-        median = _cell_medians(flat, distance, count)
-        scatter = MAD_TO_STD * _cell_medians(flat, np.abs(distance - median[flat]), count)
+        median = _compute_cell_medians(flat, distance, count)
+        scatter = MAD_TO_STD * _compute_cell_medians(flat, np.abs(distance - median[flat]), count)
         full = count >= 0.5 * _Rule.points_in_cell
         noise = float(np.quantile(scatter[full], _Rule.quiet)) if full.any() else robust_std(distance)
         beyond = np.bincount(flat, distance > FORM_RULE.off_pipe * radius, len(count))
@@ -160,7 +160,7 @@ class _Cells:
         )
 
 
-def _cell_medians(flat: np.ndarray, values: np.ndarray, count: np.ndarray) -> np.ndarray:
+def _compute_cell_medians(flat: np.ndarray, values: np.ndarray, count: np.ndarray) -> np.ndarray:
     """Return the median of the values (N,) in each cell; NaN in empty cells."""
     order = np.lexsort((values, flat))
     start, result = np.cumsum(count) - count, np.full(len(count), np.nan)

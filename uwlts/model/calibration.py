@@ -220,7 +220,7 @@ class Calibration(Brief, Description):
 
     @model_validator(mode="before")
     @classmethod
-    def _from_file(cls, content: object) -> object:
+    def _convert_from_file(cls, content: object) -> object:
         if not isinstance(content, dict):
             return content
         residuals = content.get("residuals")
@@ -230,7 +230,7 @@ class Calibration(Brief, Description):
         return content | {"residuals": figures, "joint": residuals["joint"]}
 
     @model_serializer(mode="wrap")
-    def _into_file(self, handler: SerializerFunctionWrapHandler) -> Table:
+    def _convert_to_file(self, handler: SerializerFunctionWrapHandler) -> Table:
         content = handler(self) | {"residuals": self.residuals_in_file()}
         del content["joint"]
         if self.medium_name is None:
@@ -263,12 +263,12 @@ class Calibration(Brief, Description):
         known |= {f"{name}_px": camera.pop(name, None) for name in ("cx", "cy")}
         others = {
             "distortion": camera,
-            "sheet_normal_deg": self._sheet_normal_std_deg(),
+            "sheet_normal_deg": self._find_sheet_normal_std_deg(),
             "window_distance_mm": numbers_in(self.figures("window")).get("std_mm"),
         }
         return CalibrationStd.model_validate(known | others)
 
-    def _sheet_normal_std_deg(self) -> float | None:
+    def _find_sheet_normal_std_deg(self) -> float | None:
         """Return the largest standard uncertainty of the direction of the sheet's normal, deg."""
         turns = SheetParameter.TURN_FAN, SheetParameter.TURN_AXIS  # about two orthogonal axes in the sheet
         if self.joint is None or not set(turns) <= set(self.joint.parameters):

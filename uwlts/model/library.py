@@ -220,13 +220,13 @@ def validate_sensor(levels: Sequence[Level], source: str | Path) -> Sensor:
     return sensor
 
 
-def _value(table: object, path: str) -> object:
+def _look_up(table: object, path: str) -> object:
     for key in path.split("."):
         table = table.get(key) if isinstance(table, dict) else None
     return table
 
 
-def _text(value: object) -> str:
+def _format_value(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else repr(value)
 
 
@@ -252,16 +252,16 @@ class _Inherited:
 
     def origin(self, path: str) -> Level | None:
         """Return the level that an inherited value is from; None for a value of the last level and for a default."""
-        set_by = [level for level in self._levels if _value(level.stated, path) is not None]
-        if not set_by or set_by[-1] is self._last or _value(self._last.merged, path) is None:
+        set_by = [level for level in self._levels if _look_up(level.stated, path) is not None]
+        if not set_by or set_by[-1] is self._last or _look_up(self._last.merged, path) is None:
             return None
         return set_by[-1]
 
     def changes(self, origin: Level, paths: Sequence[str]) -> list[str]:
         """Return as text the keys among ``paths`` whose values differ from those at a level."""
-        pairs = ((path, _value(origin.merged, path), _value(self._last.merged, path)) for path in paths)
+        pairs = ((path, _look_up(origin.merged, path), _look_up(self._last.merged, path)) for path in paths)
         return [
-            f"{path} ({f'{_text(before)} to ' if before is not None else 'now '}{_text(after)})"
+            f"{path} ({f'{_format_value(before)} to ' if before is not None else 'now '}{_format_value(after)})"
             for path, before, after in pairs
             if after is not None and _differ(path, before, after)
         ]
@@ -272,7 +272,7 @@ class _Inherited:
         changed = [] if origin is None else self.changes(origin, depends_on)
         if origin is None or not changed:
             return []
-        value = _text(_value(self._last.merged, path))
+        value = _format_value(_look_up(self._last.merged, path))
         because = f"but this description changes {', '.join(changed)}{misfit}"
         return [f"{self.name}: {path} = {value} is inherited from '{origin.name}', {because}: {advice}"]
 
@@ -301,13 +301,13 @@ def find_misfits(levels: Sequence[Level], sensor: Sensor) -> list[str]:
     found += _check_places(inherited, sensor)
     nm = f"{sensor.laser.wavelength_nm:g} nm"
     radius, before = sensor.laser.waist_radius_mm, inherited.origin("laser.waist_radius_mm")
-    old_nm = _value(before.merged, _WAVELENGTH) if before is not None else None
+    old_nm = _look_up(before.merged, _WAVELENGTH) if before is not None else None
     if isinstance(old_nm, int | float) and old_nm > 0:
         scaled = radius * sensor.laser.wavelength_nm / old_nm
         misfit = f"; the same line optics focus {nm} to {scaled:.3g} mm"
         found += inherited.say("laser.waist_radius_mm", [_WAVELENGTH], misfit, advice)
     for path in _AT_WAVELENGTH:
-        if not isinstance(_value(levels[-1].merged, path), str):
+        if not isinstance(_look_up(levels[-1].merged, path), str):
             material = ", or name a material such as 'N-BK7'" if path.endswith("glass") else ""
             found += inherited.say(path, [_WAVELENGTH], "", f"set the value at {nm}{material}")
     size = ["camera.width_px", "camera.height_px"]
@@ -331,7 +331,7 @@ def _check_places(inherited: _Inherited, sensor: Sensor) -> Iterator[str]:
     window = ["camera.window.distance_mm", "camera.window.thickness_mm"]
     indices = {name: medium.refractive_index(laser.wavelength_nm) for name, medium in sensor.media.items()}
     seen = {
-        name: _apparent_mm(camera.window, standoff, index=index, wavelength_nm=laser.wavelength_nm)
+        name: _compute_apparent_mm(camera.window, standoff, index=index, wavelength_nm=laser.wavelength_nm)
         for name, index in indices.items()
     }
     nearest, farthest = min(standoff, *seen.values()), max(standoff, *seen.values())
@@ -363,7 +363,7 @@ def _check_places(inherited: _Inherited, sensor: Sensor) -> Iterator[str]:
         yield (texts or [f"{inherited.name}: {misfit} of {volume.near_mm:g} to {volume.far_mm:g} mm: {advice}"])[0]
 
 
-def _apparent_mm(window: Window, distance_mm: float, *, index: float, wavelength_nm: float) -> float:
+def _compute_apparent_mm(window: Window, distance_mm: float, *, index: float, wavelength_nm: float) -> float:
     """Return the apparent distance from the pupil, for paraxial rays, of a point behind a window."""
     if not window.mounted:
         return distance_mm

@@ -77,7 +77,7 @@ def _evaluate_sellmeier(strengths: tuple[float, ...], poles_um2: tuple[float, ..
     return lambda um: math.sqrt(1 + sum(b * um**2 / (um**2 - c) for b, c in zip(strengths, poles_um2, strict=True)))
 
 
-def _soda_lime(um: float) -> float:
+def _compute_soda_lime(um: float) -> float:
     """Return n = 1.5130 - 0.003169 L^2 + 0.003962 / L^2, L in um (Rubin 1985, Solar Energy Materials 12:275)."""
     return 1.5130 - 0.003169 * um**2 + 0.003962 / um**2
 
@@ -99,8 +99,8 @@ _CAST_ACRYLIC = 41.4, "4 times the 1500 psi of continuous load, Altuglas, Plexig
 GLASSES = {
     "N-BK7": Glass(_BK7, 0.3, 2.5, 0.24, "Schott data sheet"),
     "fused-silica": Glass(_SILICA, 0.21, 3.71, 0.0, "Malitson 1965, JOSA 55:1205", FUSED_SILICA_MPA, "Harris 1999"),
-    "soda-lime": Glass(_soda_lime, 0.31, 4.6, 14.5, "Rubin 1985, clear", *_FLOAT_GLASS),
-    "soda-lime-low-iron": Glass(_soda_lime, 0.31, 4.6, 3.25, "Rubin 1985, low iron", *_FLOAT_GLASS),
+    "soda-lime": Glass(_compute_soda_lime, 0.31, 4.6, 14.5, "Rubin 1985, clear", *_FLOAT_GLASS),
+    "soda-lime-low-iron": Glass(_compute_soda_lime, 0.31, 4.6, 3.25, "Rubin 1985, low iron", *_FLOAT_GLASS),
     "sapphire": Glass(_SAPPHIRE, 0.2, 5.0, 0.0, "Malitson and Dodge 1972", *_SAPPHIRE_LIMIT),
     "PMMA": Glass(_evaluate_sellmeier((1.1819,), (0.011313,)), 0.4368, 1.052, 0.0, "Sultanova 2009", *_CAST_ACRYLIC),
 }
@@ -123,18 +123,18 @@ _OTHER_NAMES = {
 """Common names of window materials, in any case and with - or _ in place of blanks."""
 
 
-def _plain_name(name: str) -> str:
+def _simplify_name(name: str) -> str:
     return " ".join(name.replace("-", " ").replace("_", " ").casefold().split())
 
 
-_BY_PLAIN_NAME = {_plain_name(name): name for name in GLASSES} | {
-    _plain_name(other): name for other, name in _OTHER_NAMES.items()
+_BY_PLAIN_NAME = {_simplify_name(name): name for name in GLASSES} | {
+    _simplify_name(other): name for other, name in _OTHER_NAMES.items()
 }
 
 
 def find_glass(name: str) -> Glass:
     """Return the named window material, also by a common name; DescriptionError with the known names."""
-    known = _BY_PLAIN_NAME.get(_plain_name(name))
+    known = _BY_PLAIN_NAME.get(_simplify_name(name))
     if known is None:
         raise DescriptionError(
             f"unknown glass '{name}'; known are {', '.join(GLASSES)}, common names such as acrylic, or the "
@@ -210,7 +210,7 @@ class NaturalWater:
     phase: str = "petzold"
 
 
-def _station(absorption_per_m: float, scattering_per_m: float, wavelength_nm: float) -> Particles:
+def _read_station(absorption_per_m: float, scattering_per_m: float, wavelength_nm: float) -> Particles:
     """Return the particles of a station at a wavelength, scaled from 530 nm; pure sea water is subtracted."""
     check_range("wavelength_nm", wavelength_nm, 400.0, 700.0, _SOURCE)
     absorption = absorption_per_m - water_absorption_per_m(wavelength_nm=_STATION_NM)
@@ -221,7 +221,7 @@ def _station(absorption_per_m: float, scattering_per_m: float, wavelength_nm: fl
     )
 
 
-def _jerlov(column: int, wavelength_nm: float) -> Particles:
+def _read_jerlov(column: int, wavelength_nm: float) -> Particles:
     """Return the particles of a Jerlov type, a column of the tables, interpolated linearly in steps of 25 nm.
 
     The difference from pure water is interpolated, because the absorption of pure water increases steeply between 575
@@ -241,18 +241,18 @@ def _jerlov(column: int, wavelength_nm: float) -> Particles:
 
 WATERS = {
     "pure": NaturalWater("pure water", lambda wavelength_nm: Particles(0.0, 0.0)),
-    "clear": NaturalWater("Petzold's AUTEC 8, Bahamas", partial(_station, 0.114, 0.037)),
-    "coastal": NaturalWater("Petzold's HAOCE 11, California", partial(_station, 0.179, 0.219)),
-    "harbour": NaturalWater("Petzold's NUC 2040, San Diego", partial(_station, 0.366, 1.824)),
-    "jerlov-I": NaturalWater("the clearest ocean", partial(_jerlov, 1)),
-    "jerlov-IB": NaturalWater("ocean, between I and II", partial(_jerlov, 2)),
-    "jerlov-II": NaturalWater("ocean", partial(_jerlov, 3)),
-    "jerlov-III": NaturalWater("the most turbid ocean", partial(_jerlov, 4)),
-    "jerlov-1C": NaturalWater("the clearest coast", partial(_jerlov, 5)),
-    "jerlov-3C": NaturalWater("coast", partial(_jerlov, 6)),
-    "jerlov-5C": NaturalWater("coast, more turbid", partial(_jerlov, 7)),
-    "jerlov-7C": NaturalWater("coast, turbid", partial(_jerlov, 8)),
-    "jerlov-9C": NaturalWater("the most turbid coast", partial(_jerlov, 9)),
+    "clear": NaturalWater("Petzold's AUTEC 8, Bahamas", partial(_read_station, 0.114, 0.037)),
+    "coastal": NaturalWater("Petzold's HAOCE 11, California", partial(_read_station, 0.179, 0.219)),
+    "harbour": NaturalWater("Petzold's NUC 2040, San Diego", partial(_read_station, 0.366, 1.824)),
+    "jerlov-I": NaturalWater("the clearest ocean", partial(_read_jerlov, 1)),
+    "jerlov-IB": NaturalWater("ocean, between I and II", partial(_read_jerlov, 2)),
+    "jerlov-II": NaturalWater("ocean", partial(_read_jerlov, 3)),
+    "jerlov-III": NaturalWater("the most turbid ocean", partial(_read_jerlov, 4)),
+    "jerlov-1C": NaturalWater("the clearest coast", partial(_read_jerlov, 5)),
+    "jerlov-3C": NaturalWater("coast", partial(_read_jerlov, 6)),
+    "jerlov-5C": NaturalWater("coast, more turbid", partial(_read_jerlov, 7)),
+    "jerlov-7C": NaturalWater("coast, turbid", partial(_read_jerlov, 8)),
+    "jerlov-9C": NaturalWater("the most turbid coast", partial(_read_jerlov, 9)),
 }
 """All named waters. Petzold's: absorption and scattering in 1/m including sea water; Jerlov's: column of the tables."""
 

@@ -81,7 +81,7 @@ class SheetView:
     farthest_mm: float
 
 
-def _half_width_mm(
+def _compute_half_width_mm(
     window: Window, medium_index: float, wavelength_nm: float, half_slope: float, depth_mm: np.ndarray
 ) -> np.ndarray:
     """Return half the width of the view at depths outside an untilted window, from its half slope in air (Snell)."""
@@ -105,10 +105,10 @@ def view_of_sheet(sensor: Sensor, medium: Medium) -> SheetView:
         across, along, axis = along, across, 1
     depth = np.linspace(0.0, 10 * standoff, 20001)
     sheet = (pose.normal @ pose.origin_mm - pose.normal[2] * (depth + outer)) / pose.normal[axis]
-    seen = np.abs(sheet) <= _half_width_mm(camera.window, index, wavelength, across, depth)
+    seen = np.abs(sheet) <= _compute_half_width_mm(camera.window, index, wavelength, across, depth)
     if not seen.any():
         raise DesignError("the sheet never crosses the camera's view: change baseline, angle or focal length")
-    length = 2 * _half_width_mm(camera.window, index, wavelength, along, np.array([standoff]))[0]
+    length = 2 * _compute_half_width_mm(camera.window, index, wavelength, along, np.array([standoff]))[0]
     return SheetView(float(standoff), float(length), float(depth[seen][0]), float(depth[seen][-1]))
 
 
@@ -121,7 +121,7 @@ def check_design(sensor: Sensor, medium: Medium) -> SheetView:
     camera, laser = sensor.camera, sensor.laser
     window = camera.window
     if window.mounted:
-        half = _half_width_mm(window, 1.0, laser.wavelength_nm, camera.corner_slope(), np.zeros(1))[0]
+        half = _compute_half_width_mm(window, 1.0, laser.wavelength_nm, camera.corner_slope(), np.zeros(1))[0]
         needed = 2 * half + camera.focal_length_mm / camera.f_number
         if needed > window.aperture_diameter_mm:
             raise DesignError(

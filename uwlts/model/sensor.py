@@ -403,7 +403,7 @@ class Medium(Description):
         if not self._is_water():
             return 0.0
         pure = media.water_absorption_per_m(wavelength_nm=wavelength_nm)
-        return 1e-3 * (pure + self._particles(wavelength_nm).absorption_per_m)
+        return 1e-3 * (pure + self._look_up_particles(wavelength_nm).absorption_per_m)
 
     def scattering_per_mm(self, wavelength_nm: float) -> float:
         """Return the scattering coefficient b in 1/mm; RangeError outside the tables."""
@@ -412,11 +412,11 @@ class Medium(Description):
     def scatterers(self, wavelength_nm: float) -> tuple[phase_functions.Scatterer, ...]:
         """Return the kinds of scatterers with their coefficients and phase functions; RangeError outside the tables."""
         if self.scattering_per_m is not None:
-            parts = [(self.scattering_per_m, self._phase_function())]
+            parts = [(self.scattering_per_m, self._make_phase_function())]
         elif self._is_water():
             molecules = media.water_scattering_per_m(wavelength_nm=wavelength_nm, salinity_g_kg=self.salinity_g_kg)
-            particles = self._particles(wavelength_nm).scattering_per_m
-            parts = [(molecules, phase_functions.Molecular()), (particles, self._phase_function())]
+            particles = self._look_up_particles(wavelength_nm).scattering_per_m
+            parts = [(molecules, phase_functions.Molecular()), (particles, self._make_phase_function())]
         else:
             parts = []
         return tuple(phase_functions.Scatterer(1e-3 * b, phase) for b, phase in parts if b > 0)
@@ -425,12 +425,12 @@ class Medium(Description):
         """Return whether absorption and scattering follow from the properties of water."""
         return self.kind in ("fresh", "sea") or self.water is not None or self.turbidity is not None
 
-    def _particles(self, wavelength_nm: float) -> media.Particles:
+    def _look_up_particles(self, wavelength_nm: float) -> media.Particles:
         if self.turbidity is not None:
             return media.particles_at(self.turbidity, wavelength_nm=wavelength_nm)
         return media.WATERS[self.water or "pure"].particles(wavelength_nm)
 
-    def _phase_function(self) -> phase_functions.PhaseFunction:
+    def _make_phase_function(self) -> phase_functions.PhaseFunction:
         if isinstance(self.phase, phase_functions.DescribedPhase):
             return self.phase.phase_function()
         # The turbidity scale interpolates between Petzold's stations.

@@ -209,7 +209,7 @@ def fit_brightness_slopes(
     if reach < 1:
         return np.zeros(len(frame))
     bright = np.log(amplitude / exposure_ms[frame] if np.all(exposure_ms[there] > 0) else amplitude)
-    return _slopes_by_position(row_of[frame], line, bright, position, rows=reach)
+    return _fit_slopes_by_position(row_of[frame], line, bright, position, rows=reach)
 
 
 def footprint_std(uncertainty: Uncertainty) -> float:
@@ -251,9 +251,9 @@ def estimate_blur_shift_px(
         columns = frame, line, centre_px, amplitude, width_px
         moved[order] = estimate_blur_shift_px(*(column[order] for column in columns))
         return moved
-    lean = _slopes_along(frame, line, centre_px, _BEND_LINES)
-    bend = _slopes_along(frame, line, lean, _BEND_LINES)
-    fading = _slopes_along(frame, line, np.log(amplitude), _LINES)
+    lean = _fit_slopes_along(frame, line, centre_px, _BEND_LINES)
+    bend = _fit_slopes_along(frame, line, lean, _BEND_LINES)
+    fading = _fit_slopes_along(frame, line, np.log(amplitude), _LINES)
     variance = (width_px / FWHM_PER_SIGMA) ** 2 / (1.0 + lean**2)
     return variance * (lean * fading + 0.5 * bend)
 
@@ -272,7 +272,7 @@ def select_sharp_lines(stripes: CaptureStripes) -> tuple[np.ndarray, np.ndarray]
     return sharp, moved[sharp]
 
 
-def _slopes_along(frame: np.ndarray, line: np.ndarray, values: np.ndarray, reach: int) -> np.ndarray:
+def _fit_slopes_along(frame: np.ndarray, line: np.ndarray, values: np.ndarray, reach: int) -> np.ndarray:
     """Return the slopes (N,) per line of straight lines fitted to values within ``reach`` lines of the same image.
 
     The values are sorted by image and line.
@@ -302,7 +302,7 @@ def _fit_lines(frame: np.ndarray, line: np.ndarray, values: np.ndarray, reach: i
             slopes[k] = (xz / n - x1 / n * z1 / n) / square
 
 
-def _slopes_by_position(
+def _fit_slopes_by_position(
     row: np.ndarray, column: np.ndarray, values: np.ndarray, position: np.ndarray, *, rows: int
 ) -> np.ndarray:
     """Return the slopes (N,) per position of planes fitted to the values within ``rows`` images."""

@@ -86,7 +86,7 @@ def project_through_window(
     distance = np.linalg.norm(offset, axis=1)
     depth = height - inner - thickness
     depth[depth <= 0] = np.nan
-    tangent = _tangent_in_air((inner, thickness, depth), (1.0, window.glass_index, medium_index), distance)
+    tangent = _solve_tangent_in_air((inner, thickness, depth), (1.0, window.glass_index, medium_index), distance)
     slope = np.divide(tangent, distance, out=np.zeros_like(distance), where=distance > 0)
     toward = normal + slope[:, None] * offset
     toward[np.isnan(depth)] = np.nan
@@ -102,7 +102,7 @@ def _require_finite(name: str, values: np.ndarray) -> np.ndarray:
     return values
 
 
-def _tangent_in_air(
+def _solve_tangent_in_air(
     heights: tuple[float, float, np.ndarray], indices: tuple[float, float, float], distance: np.ndarray
 ) -> np.ndarray:
     """Return the tangent (N,) of the angle in the first layer, of index 1, of rays with a given lateral ``distance``.
@@ -131,19 +131,19 @@ def _project(camera: CameraModel, points: np.ndarray) -> np.ndarray:
     z = np.where(points[:, 2] > 0, points[:, 2], np.nan)
     x, y = points[:, 0] / z, points[:, 1] / z
     if camera.coefficients().any():
-        outside = x * x + y * y >= _largest_square(camera.distortion)
+        outside = x * x + y * y >= _find_largest_square(camera.distortion)
         x, y = _distort(camera.distortion, x, y)
         x[outside] = np.nan
         y[outside] = np.nan
     return np.stack([camera.fx_px * x + camera.cx_px, camera.fy_px * y + camera.cy_px], axis=1)
 
 
-def _largest_square(d: Distortion) -> float:
-    return _edge_square(d.k1, d.k2, d.p1, d.p2, d.k3, d.k4, d.k5, d.k6)
+def _find_largest_square(d: Distortion) -> float:
+    return _find_edge_square(d.k1, d.k2, d.p1, d.p2, d.k3, d.k4, d.k5, d.k6)
 
 
 @lru_cache(maxsize=16)
-def _edge_square(k1: float, k2: float, p1: float, p2: float, k3: float, k4: float, k5: float, k6: float) -> float:
+def _find_edge_square(k1: float, k2: float, p1: float, p2: float, k3: float, k4: float, k5: float, k6: float) -> float:
     """Return the squared radius of the domain where the distortion is one-to-one, or infinity if it is everywhere.
 
     The Jacobian of the distortion is symmetric. If it is positive definite on a disc, no two points of the disc have
@@ -164,42 +164,42 @@ def _edge_square(k1: float, k2: float, p1: float, p2: float, k3: float, k4: floa
     return float(ends.max() ** -2) if len(ends) else math.inf
 
 
-def _radial(d: Distortion, s: np.ndarray) -> np.ndarray:
+def _compute_radial(d: Distortion, s: np.ndarray) -> np.ndarray:
     """Return the radial factor g at squared radii s."""
     above = 1.0 + s * (d.k1 + s * (d.k2 + s * d.k3))
-    return above / _below(d, s) if d.is_rational() else above
+    return above / _compute_denominator(d, s) if d.is_rational() else above
 
 
-def _below(d: Distortion, s: np.ndarray) -> np.ndarray:
+def _compute_denominator(d: Distortion, s: np.ndarray) -> np.ndarray:
     """Return the denominator of the radial factor at squared radii s."""
     return 1.0 + s * (d.k4 + s * (d.k5 + s * d.k6))
 
 
-def _radial_slope(d: Distortion, s: np.ndarray) -> np.ndarray:
+def _differentiate_radial(d: Distortion, s: np.ndarray) -> np.ndarray:
     """Return the derivative of the radial factor with respect to s."""
     slope = d.k1 + s * (2.0 * d.k2 + s * (3.0 * d.k3))
     if not d.is_rational():
         return slope
-    return (slope - _radial(d, s) * (d.k4 + s * (2.0 * d.k5 + s * (3.0 * d.k6)))) / _below(d, s)
+    return (slope - _compute_radial(d, s) * (d.k4 + s * (2.0 * d.k5 + s * (3.0 * d.k6)))) / _compute_denominator(d, s)
 
 
-def _growth(d: Distortion, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _find_growth(d: Distortion, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the squared radius, and the factor of the coordinates in `_distort`."""
     s = x * x + y * y
-    return s, _radial(d, s) + 2.0 * (d.p1 * y + d.p2 * x)
+    return s, _compute_radial(d, s) + 2.0 * (d.p1 * y + d.p2 * x)
 
 
 def _distort(d: Distortion, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distort ideal image coordinates, in units of the focal length (OpenCV, module calib3d)."""
-    s, growth = _growth(d, x, y)
+    s, growth = _find_growth(d, x, y)
     return x * growth + d.p2 * s, y * growth + d.p1 * s
 
 
-def _jacobian(
+def _compute_jacobian(
     d: Distortion, x: np.ndarray, y: np.ndarray, s: np.ndarray, growth: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the derivatives xx, xy = yx, yy of `_distort`; ``s`` and ``growth`` are the results of `_growth`."""
-    slope = _radial_slope(d, s)
+    """Return the derivatives xx, xy = yx, yy of `_distort`; ``s`` and ``growth`` are the results of `_find_growth`."""
+    slope = _differentiate_radial(d, s)
     x_slope, y_slope = 2.0 * (slope * x + d.p2), 2.0 * (slope * y + d.p1)
     return growth + x * (x_slope + 2.0 * d.p2), x * y_slope + (2.0 * d.p2) * y, growth + y * (y_slope + 2.0 * d.p1)
 
@@ -213,27 +213,27 @@ def image_derivatives(camera: CameraModel, pixels: np.ndarray, ideal: np.ndarray
     """
     (x, y), d = ideal, camera.distortion
     focal, centre = np.array([camera.fx_px, camera.fy_px]), np.array([camera.cx_px, camera.cy_px])
-    s, growth = _growth(d, x, y)
-    xx, xy, yy = _jacobian(d, x, y, s, growth)
+    s, growth = _find_growth(d, x, y)
+    xx, xy, yy = _compute_jacobian(d, x, y, s, growth)
     change = np.zeros((14, 2, len(x)))
     change[[0, 1], [0, 1]] = 1.0 / focal[:, None]
     change[[2, 3], [0, 1]] = (centre - pixels).T / focal[:, None] ** 2
     change[[4, 5], [0, 1]] = -1.0 / focal[:, None]
-    powers = np.stack([s, s**2, s**3])[:, None] * ideal / _below(d, s)
-    change[[6, 7, 10]], change[11:] = -powers, _radial(d, s) * powers
+    powers = np.stack([s, s**2, s**3])[:, None] * ideal / _compute_denominator(d, s)
+    change[[6, 7, 10]], change[11:] = -powers, _compute_radial(d, s) * powers
     change[8] = -2.0 * x * y, -s - 2.0 * y * y
     change[9] = -s - 2.0 * x * x, -2.0 * x * y
     first, second = yy * change[:, 0] - xy * change[:, 1], xx * change[:, 1] - xy * change[:, 0]
     return np.stack([first, second], axis=1) / (xx * yy - xy * xy)
 
 
-def _newton_step(
+def _compute_newton_step(
     d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray, x: np.ndarray, y: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return Newton's step (x, y) towards the inverse of `_distort`, and the present residual."""
-    s, growth = _growth(d, x, y)
+    s, growth = _find_growth(d, x, y)
     x_missing, y_missing = x_seen - x * growth - d.p2 * s, y_seen - y * growth - d.p1 * s
-    xx, xy, yy = _jacobian(d, x, y, s, growth)
+    xx, xy, yy = _compute_jacobian(d, x, y, s, growth)
     scale = 1.0 / (xx * yy - xy * xy)
     x_step, y_step = (yy * x_missing - xy * y_missing) * scale, (xx * y_missing - xy * x_missing) * scale
     return x_step, y_step, np.abs(x_missing) + np.abs(y_missing)
@@ -243,16 +243,16 @@ def _undistort(d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray) -> tuple[n
     """Invert `_distort` in its domain about the centre; NaN outside the image of the domain."""
     allowed = _is_allowed(x_seen, y_seen)
     with np.errstate(all="ignore"):
-        start = 1.0 / _radial(d, x_seen * x_seen + y_seen * y_seen)
+        start = 1.0 / _compute_radial(d, x_seen * x_seen + y_seen * y_seen)
         x, y = start * x_seen, start * y_seen
         found = np.zeros(len(x), dtype=bool)
         for _ in range(_USUAL_STEPS):
-            x_step, y_step, missing = _newton_step(d, x_seen, y_seen, x, y)
+            x_step, y_step, missing = _compute_newton_step(d, x_seen, y_seen, x, y)
             found = missing <= allowed
             if found.all():
                 break
             x, y = x + x_step, y + y_step
-        found &= x * x + y * y < _largest_square(d)
+        found &= x * x + y * y < _find_largest_square(d)
     if not found.all():
         hard = np.flatnonzero(~found)
         x[hard], y[hard] = _undistort_damped(d, x_seen[hard], y_seen[hard])
@@ -265,11 +265,11 @@ def _undistort_damped(d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray) -> 
     A step is halved until it stays in the domain and reduces the residual. Because the Jacobian is positive definite in
     the domain, a short enough step always reduces it.
     """
-    largest, allowed = _largest_square(d), _is_allowed(x_seen, y_seen)
+    largest, allowed = _find_largest_square(d), _is_allowed(x_seen, y_seen)
     x, y = np.zeros_like(x_seen), np.zeros_like(y_seen)
     x_next, y_next, missing = x, y, np.full_like(x, np.inf)
     for _ in range(_MOST_STEPS):
-        x_step, y_step, missing = _newton_step(d, x_seen, y_seen, x, y)
+        x_step, y_step, missing = _compute_newton_step(d, x_seen, y_seen, x, y)
         length, helps = np.ones_like(x), np.zeros(len(x), dtype=bool)
         for _ in range(_MOST_HALVINGS):
             x_next, y_next = x + length * x_step, y + length * y_step

@@ -24,7 +24,7 @@ def _check_images(camera: Camera, calibration: AnyCalibration, *, source: str) -
             f"{source} has images of {size[0]} x {size[1]} pixels, the calibration is for {wanted[0]} x {wanted[1]}: "
             f"{advice}"
         )
-    offsets = _offsets(calibration)
+    offsets = _list_offsets(calibration)
     if camera.offset_px is not None and offsets - {camera.offset_px}:
         raise CalibrationError(
             f"{source} has images from {camera.offset_px} px of the image sensor, the calibration is for images from "
@@ -75,7 +75,7 @@ def check_fits(header: CaptureHeader, calibration: AnyCalibration, *, source: st
             f"({calibration.medium_kind}), which includes the refraction: calibrate in air"
         )
     warnings = [f"{named}: check that it is the right one"] if other else []
-    if (camera.offset_px is None) == bool(_offsets(calibration)):
+    if (camera.offset_px is None) == bool(_list_offsets(calibration)):
         warnings.append(
             f"only one of {source} and the calibration states the images' offset on the image sensor "
             "(offset_px): check that it is the same"
@@ -87,7 +87,7 @@ def check_fits(header: CaptureHeader, calibration: AnyCalibration, *, source: st
     return warnings
 
 
-def _offsets(calibration: AnyCalibration) -> set[tuple[int, int]]:
+def _list_offsets(calibration: AnyCalibration) -> set[tuple[int, int]]:
     """Return the stated offsets of a calibration's images on the image sensor, px."""
     if isinstance(calibration, PolynomialCalibration):
         stated = calibration.provenance.get("offset_px")

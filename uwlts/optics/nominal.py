@@ -75,13 +75,13 @@ def nominal_calibration(sensor: Sensor, medium: Medium | None = None) -> Calibra
         window=WindowModel.from_description(camera.window, sensor.laser.wavelength_nm)
         if camera.window.mounted
         else None,
-        sheet=_sheet(sensor, medium),
+        sheet=_make_sheet(sensor, medium),
         camera_from_object=to_rows(camera_from_object(sensor)),
         provenance={"source": f"description of the sensor '{sensor.name}'"},
     )
 
 
-def _sheet(sensor: Sensor, medium: Medium | None) -> SheetModel:
+def _make_sheet(sensor: Sensor, medium: Medium | None) -> SheetModel:
     """Return the plane of the fan, or the plane fitted to its rays in a medium over the depths in the camera's view."""
     laser, pose = sensor.laser, laser_pose(sensor)
     if medium is None:
@@ -183,11 +183,11 @@ def design(sensor: str | Path | Sensor, *, medium: str) -> list[DesignRow]:
         DesignRow("image plane to lens axis, sheet in focus", math.degrees(tilt), "deg", "Eq. 2.12, Scheimpflug"),
         DesignRow("speckle limit across the camera's axis", speckle, "um", "Dorsch et al. 1994, contrast 0.71"),
         DesignRow("speckle limit along the laser's axis", speckle * leaning / tangent, "um", "over sin theta_t"),
-        *_window_rows(camera.window.aperture_diameter_mm),
+        *_list_window_rows(camera.window.aperture_diameter_mm),
     ]
 
 
-def _window_rows(aperture_mm: float) -> list[DesignRow]:
+def _list_window_rows(aperture_mm: float) -> list[DesignRow]:
     """Return the thickness of a window of each material with a known strength, for the pressure at 100 m."""
     return [
         DesignRow(

@@ -164,12 +164,12 @@ def reconstruct_profile(
 
     Raises RangeError as for `points_on_sheet` and `stage_travel`.
     """
-    found = _profile_points(calibration, lines, centres_px, medium_index=medium_index)
+    found = _compute_profile_points(calibration, lines, centres_px, medium_index=medium_index)
     points = to_object(calibration, found.points_mm, stage_mm=stage_mm, stage_direction=stage_direction)
     return MeasuredPoints(points, found.status)
 
 
-def _profile_points(
+def _compute_profile_points(
     calibration: Calibration, lines: np.ndarray, centres_px: np.ndarray, *, medium_index: float
 ) -> MeasuredPoints:
     """Return the points of `points_on_sheet`, from a `LineTable` if one is worth making."""
@@ -223,7 +223,7 @@ def rays_on_sheet(
     found = []
     for block in np.split(pixels, range(_BLOCK, len(pixels), _BLOCK)):
         rays = trace_window(directions(calibration.camera, block), calibration.window, medium_index=medium_index)
-        found.append((*_crossings(rays, sheet), rays.directions))
+        found.append((*_intersect(rays, sheet), rays.directions))
     points, status, slope, along = found[0] if len(found) == 1 else map(np.concatenate, zip(*found, strict=True))
     return MeasuredPoints(points, status), along, slope
 
@@ -258,7 +258,7 @@ def stage_travel(stage_mm: np.ndarray | float, stage_direction: np.ndarray) -> n
     return np.multiply.outer(stage_direction, stage_mm) if stage_mm.ndim else (stage_mm * stage_direction)[:, None]
 
 
-def _crossings(rays: RaysInMedium, sheet: SheetSurface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _intersect(rays: RaysInMedium, sheet: SheetSurface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Intersect rays in the medium with the sheet: points (N, 3), status (N,), and gradient (N,) along the rays.
 
     For a plane this is thesis Eq. 3.9. The status of a ray that does not meet the sheet in the medium is BEHIND or

@@ -171,16 +171,16 @@ class FigureCollector:
 
     def add(self, figure: go.Figure, caption: str = "") -> InteractiveFigure:
         """Add a plotly figure with a height."""
-        self.scripts.append(_script_json(figure.to_json(validate=False) or ""))
+        self.scripts.append(_encode_for_script(figure.to_json(validate=False) or ""))
         return InteractiveFigure(len(self.scripts) - 1, caption, int(figure.layout.height))
 
     def add_cloud(self, points: CloudPoints, caption: str) -> InteractiveFigure:
         """Add a cloud."""
-        self.clouds.append(_script_json(points.to_json()))
+        self.clouds.append(_encode_for_script(points.to_json()))
         return InteractiveFigure(len(self.clouds) - 1, caption)
 
 
-def _script_json(text: str) -> Markup:
+def _encode_for_script(text: str) -> Markup:
     """Return JSON for a script element, where there is no escaping: the text must not contain its end tag."""
     return Markup(text.replace("<", "\\u003c"))
 

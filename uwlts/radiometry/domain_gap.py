@@ -203,7 +203,7 @@ def measure_domain_gap(
     ]
     ours, theirs = tuple(found[: len(generated)]), tuple(found[len(generated) :])
     pairs = [(one, other) for other, one in product(theirs, found) if one is not other]
-    return DomainGap(ours, theirs, tuple(_set_gap(*pair) for pair in pairs), tuple(map(_floor, theirs)))
+    return DomainGap(ours, theirs, tuple(_set_gap(*pair) for pair in pairs), tuple(map(_measure_floor, theirs)))
 
 
 def _set_gap(generated: StripeWindows, real: StripeWindows) -> SetGap:
@@ -229,7 +229,7 @@ def _set_gap(generated: StripeWindows, real: StripeWindows) -> SetGap:
     )
 
 
-def _floor(real: StripeWindows) -> GapFloor:
+def _measure_floor(real: StripeWindows) -> GapFloor:
     """Return the gap between random halves of the images of a real set, or of its parts if it has few images."""
     windows, rng = _thin(real), np.random.default_rng(0)
     values = _replace_by_quantiles(windows.values, windows.values)[0]

@@ -158,7 +158,7 @@ def fit_radiometry(
         with nullcontext() if repeats is None else open_capture(repeats) as again:
             noise = measure_noise(scan if again is None else again)
         parts = (
-            *evidence.judge(whole, covariance, _natural_absorption(scan.header)),
+            *evidence.judge(whole, covariance, _bound_natural_absorption(scan.header)),
             *([] if noise is None else [noise.fit]),
         )
         # With another phase function the absorption may seem unnatural: that is said, too.
@@ -260,9 +260,9 @@ class _Evidence:
         held = images.of_group >= 0
 
         def mean(values: np.ndarray) -> np.ndarray:
-            return _mean_of(images.of_group[held], values[held])
+            return _average_groups(images.of_group[held], values[held])
 
-        mean_of_block = partial(_mean_of, images.block)
+        mean_of_block = partial(_average_groups, images.block)
         sheet, ray = mean(light.sheet_per_px), mean(light.ray_per_px)
         to_laser, to_camera = mean(light.laser_path_mm), mean(light.camera_path_mm)
         index = calibration.medium_index(header.medium)
@@ -332,7 +332,7 @@ class _Evidence:
         background, scattering = float(np.min(images.tail[kept])), 0.0
         for _ in range(_ROUNDS):
             scattering, background = self._fit_tail(kept, background)
-        design, bright = self._brightness(scattering, background)
+        design, bright = self._make_brightness_equations(scattering, background)
         rest, weight = _fit_robustly(design[some], bright[some])
         root = np.sqrt(weight)
         # Rows for what is known: the attenuation if it is given, and the fan's described power.
@@ -353,17 +353,17 @@ class _Evidence:
             float(np.mean(sigma)), math.sqrt(max(grain[0], 0.0)), length, slope, curve,
         ])  # fmt: skip
 
-    def _brightness(self, scattering: float, background: float) -> tuple[np.ndarray, np.ndarray]:
+    def _make_brightness_equations(self, scattering: float, background: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the design matrix (M, 4) of level, path and fan, and the logarithm (M,) of the light to explain."""
         images, path_m = self.images, 1e-3 * (self.paths - self.path_mm)
         light = np.maximum(images.light - images.width * background, 1e-3)
         design = np.column_stack([np.ones_like(path_m), -path_m, self.fan, self.fan**2 - 1 / 3])
         return design, np.log(light / (self.model * self.within(scattering)[images.block]))
 
-    def _halo(self, scattering: float, background: float) -> np.ndarray:
+    def _compute_halo(self, scattering: float, background: float) -> np.ndarray:
         """Return the grey values (BLOCKS, TAIL_PX) of the halo."""
         images = self.images
-        light = _mean_of(images.block, images.light - images.width * background)
+        light = _average_groups(images.block, images.light - images.width * background)
         return self.tails(scattering) * (light / self.within(scattering))[:, None]
 
     def _fit_tail(self, kept: np.ndarray, background: float) -> tuple[float, float]:
@@ -375,7 +375,7 @@ class _Evidence:
         tail, count = self.images.tail[kept, first:], self.images.tail_count[kept, first:]
 
         def background_and_misfit(b: float) -> tuple[float, float]:
-            rest = tail - self._halo(b, background)[kept, first:]
+            rest = tail - self._compute_halo(b, background)[kept, first:]
             level = float(np.sum(count * rest) / np.sum(count))
             return level, float(np.sum(count * (rest - level) ** 2))
 
@@ -389,13 +389,13 @@ class _Evidence:
         """Judge the fit of light along the stripe, halo and background, and the absorption, for `_NAMES`."""
         value = dict(zip(_NAMES, whole.tolist(), strict=True))
         fitted = value["scattering_per_m"], value["background_dn"]
-        rest = _fit_robustly(*self._brightness(*fitted))[0]
+        rest = _fit_robustly(*self._make_brightness_equations(*fitted))[0]
         # A pattern along the fan is the laser's: it repeats in all images.
         cell = np.argsort(np.argsort(self.fan)) // BLOCKS
-        scatter = robust_std(rest - _mean_of(cell, rest)[cell])
+        scatter = robust_std(rest - _average_groups(cell, rest)[cell])
         grain = value["grain_contrast"] * math.sqrt(value["grain_length_lines"] / GROUP_LINES)
         first = max(self.images.width // 2, TAIL_FIRST_PX)
-        halo = self._halo(*fitted)[:, first:]
+        halo = self._compute_halo(*fitted)[:, first:]
         beside = self.images.tail[:, first:] - fitted[1] - halo
         between = robust_std(np.diff(beside, axis=1))  # neighbouring pixels: noise, times the root of two
         cells = np.array([part.mean(axis=1) for part in np.array_split(beside, halo.shape[1] // _CELL_PX, axis=1)])
@@ -434,7 +434,7 @@ class _Evidence:
         )
 
 
-def _mean_of(group: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _average_groups(group: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the mean (G,) of the values (N,) of each group; ``group`` (N,) numbers those of the values."""
     return np.bincount(group, values) / np.bincount(group)
 
@@ -446,7 +446,7 @@ def _choose_phase(header: CaptureHeader) -> PhaseFunction:
     return particles[-1] if particles else PetzoldAverage()
 
 
-def _natural_absorption(header: CaptureHeader) -> tuple[float, float]:
+def _bound_natural_absorption(header: CaptureHeader) -> tuple[float, float]:
     """Return the least and largest absorption of natural water, 1/m; of a medium with a described absorption, any."""
     if header.medium.kind not in ("fresh", "sea") or header.medium.absorption_per_m is not None:
         return 0.0, math.inf

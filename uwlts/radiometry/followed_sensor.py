@@ -39,7 +39,7 @@ def follow_sensor(
     ``attenuation_per_m`` is the attenuation for which the power was fitted. ``dark_e`` is the dark current in electrons
     during the exposure of the laser images.
     """
-    sensor, laser = header.sensor, _placement(header.sensor, calibration)
+    sensor, laser = header.sensor, _place_laser(header.sensor, calibration)
     detector: dict[str, Any] = {}
     gain = sensor.detector.gain_dn_per_e()
     if value.get("gain_dn_per_e", 0.0) > 0:
@@ -50,7 +50,7 @@ def follow_sensor(
         laser["power_mw"] = value["power_reflectance_mw"] / reflectance * sensor.detector.gain_dn_per_e() / gain
     if "sheet_radius_mm" in value:
         index, radius = calibration.medium_index(header.medium), value["sheet_radius_mm"]
-        waist = _waist_radius_mm(sensor.laser, radius, sheet_distance_mm, medium_index=index)
+        waist = _solve_waist_radius_mm(sensor.laser, radius, sheet_distance_mm, medium_index=index)
         laser |= {} if waist is None else {"waist_radius_mm": waist}
     if "dark_noise_dn" in value:
         detector["read_noise_e"] = math.sqrt(max((value["dark_noise_dn"] / gain) ** 2 - dark_e, 0.0))
@@ -97,7 +97,7 @@ def _calibrate_camera(sensor: Sensor, calibration: Calibration) -> Any:
     return camera.model_copy(update=update)
 
 
-def _placement(sensor: Sensor, calibration: Calibration) -> dict[str, Any]:
+def _place_laser(sensor: Sensor, calibration: Calibration) -> dict[str, Any]:
     """Return the keys of a laser in the calibrated sheet; the roll turns the described normal into the sheet's."""
     pose = calibrated_pose(sensor, calibration)
     vectors = {"origin_mm": tuple(pose.origin_mm.tolist()), "axis": tuple(pose.axis.tolist())}
@@ -107,7 +107,7 @@ def _placement(sensor: Sensor, calibration: Calibration) -> dict[str, Any]:
     return bare | {"roll_deg": roll}
 
 
-def _waist_radius_mm(laser: Laser, radius_mm: float, distance_mm: float, *, medium_index: float) -> float | None:
+def _solve_waist_radius_mm(laser: Laser, radius_mm: float, distance_mm: float, *, medium_index: float) -> float | None:
     """Return the waist radius at the described focus that gives a radius at a distance; None if diffraction forbids it.
 
     The equation of `sheet_sigma_mm` is quadratic in the squared waist. Of two solutions, the larger waist is returned:

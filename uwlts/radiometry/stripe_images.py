@@ -121,7 +121,7 @@ def measure_stripes(
         line = stripes.line[members]
         image = capture.image(frame)
         profiles = (image if along == "height" else image.T).astype(np.float32)
-        for run in _runs(line, usable[members]):
+        for run in _split_runs(line, usable[members]):
             chosen = members[run]
             part = _measure_run(profiles, stripes.line[chosen], stripes.centre_px[chosen], core, CLIPPED * full_dn)
             peaks.append(part.values[:, TAIL_PX])
@@ -201,7 +201,7 @@ class _Part(NamedTuple):
         return np.array([np.mean(d[: len(d) - lag] * d[lag:]) for lag in range(_LAGS + 1)])
 
 
-def _runs(line: np.ndarray, usable: np.ndarray) -> Iterator[np.ndarray]:
+def _split_runs(line: np.ndarray, usable: np.ndarray) -> Iterator[np.ndarray]:
     """Yield the places of consecutive usable lines, at least `SMOOTH_LINES` long."""
     breaks = np.flatnonzero((np.diff(line) != 1) | (usable[1:] != usable[:-1])) + 1
     for run in np.split(np.arange(len(line)), breaks):
@@ -277,7 +277,7 @@ def measure_noise(source: Capture) -> CameraNoise | None:
     # Each part of the jackknife has a piece of the stripe: all images of some of its lines.
     across = 1 if source.header.sensor.camera.stripe_along == "height" else 2
     pieces = zip(*(np.array_split(each, BLOCKS, axis=across) for each in (mean, variance)), strict=True)
-    counted = np.array([_bin_variance(m.ravel(), v.ravel(), edges) for m, v in pieces])
+    counted = np.array([_sum_by_bins(m.ravel(), v.ravel(), edges) for m, v in pieces])
     whole = _fit_transfer(counted.sum(axis=0), background_dn)
     if whole is None:
         return None
@@ -285,7 +285,7 @@ def measure_noise(source: Capture) -> CameraNoise | None:
     std = np.sqrt(np.diag(jackknife(left - left.mean(axis=0))))
     # The intercept is the variance of the pixels beside the stripe, which includes the shot noise of its halo.
     lines_last = mean if across == 2 else mean.transpose(0, 2, 1)
-    halo = whole[0] * max(background_dn - _dimmest(lines_last, background_dn + dark_dn), 0.0)
+    halo = whole[0] * max(background_dn - _find_dimmest(lines_last, background_dn + dark_dn), 0.0)
     dark = math.sqrt(max(whole[1] - halo, 0.0))
     variance_std = math.hypot(float(std[1]), _HALO_STD * halo)
     freedom = float(np.mean([len(numbers) - 1 for numbers in repeated]))
@@ -316,7 +316,7 @@ def _find_repeats(capture: Capture) -> list[np.ndarray]:
     return [numbers for numbers in np.split(lit, np.flatnonzero(moved) + 1) if len(numbers) > 1]
 
 
-def _bin_variance(mean: np.ndarray, variance: np.ndarray, edges: np.ndarray) -> np.ndarray:
+def _sum_by_bins(mean: np.ndarray, variance: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Return the number, and the sums of means and of variances, (3, B) of pixels in bins of their mean."""
     cell = np.digitize(mean, edges) - 1
     held = (cell >= 0) & (cell < len(edges) - 1) & np.isfinite(variance)
@@ -324,7 +324,7 @@ def _bin_variance(mean: np.ndarray, variance: np.ndarray, edges: np.ndarray) -> 
     return np.array(sums, dtype=float)
 
 
-def _dimmest(mean: np.ndarray, most: float) -> float:
+def _find_dimmest(mean: np.ndarray, most: float) -> float:
     """Return the least mean grey value of bands across the stripe, from pixels of images (G, N, L) below ``most``."""
     dark = np.where(mean < most, mean, np.nan)
     bands = [dark[:, at : at + _BAND_PX] for at in range(0, dark.shape[1] - _BAND_PX + 1, _BAND_PX)]

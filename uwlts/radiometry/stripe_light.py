@@ -95,7 +95,7 @@ def stripe_light(
     pixels = stack_pixels(stripes.line, stripes.centre_px, stripe_along=calibration.stripe_along)
     found = points_on_sheet(calibration, pixels, medium_index=index)
     good = found.status == RayStatus.OK
-    normal = _normals(header, calibration, found.points_mm, stage_mm[stripes.frame], good)
+    normal = _estimate_normals(header, calibration, found.points_mm, stage_mm[stripes.frame], good)
     return light_at(header.sensor, calibration, pixels, normal, medium_index=index)
 
 
@@ -111,7 +111,7 @@ def light_at(
     point, ray, slope = found.points_mm[:count], rays[:count], slopes[:count]
     along = (found.points_mm[count:] - point) / _MOVED_PX
     pose = calibrated_pose(sensor, calibration)
-    direction, per_mm, path, angle = _fan_light(sensor.laser, pose, point, medium_index=medium_index)
+    direction, per_mm, path, angle = _compute_fan_light(sensor.laser, pose, point, medium_index=medium_index)
     lit, seen = np.abs(np.vecdot(normal, direction)), np.abs(np.vecdot(normal, ray))
     window = calibration.window if sensor.camera.window.mounted else None
     in_air = directions(calibration.camera, pixels)
@@ -189,7 +189,7 @@ def _grey_per_radiance(sensor: Sensor, index: float) -> float:
     return per_irradiance * aperture / index**2 * windows[0] * windows[1]
 
 
-def _fan_light(
+def _compute_fan_light(
     laser: Laser, pose: LaserPose, point: np.ndarray, *, medium_index: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the fan's light at points (N, 3), by refraction at a window normal to the axis.
@@ -208,12 +208,12 @@ def _fan_light(
     tilt = 1 / np.sqrt(1 + ray.slope_outside**2)
     angle = np.copysign(np.arctan(ray.slope), y)
     direction = tilt[:, None] * (np.copysign(ray.slope_outside, y)[:, None] * pose.fan + pose.axis)
-    per_mm = _power_per_rad(laser, angle) / (ray.growth_mm * (1 + ray.slope**2) * tilt)
+    per_mm = _compute_power_per_rad(laser, angle) / (ray.growth_mm * (1 + ray.slope**2) * tilt)
     path = length_outside_mm(np, geometry, ray)
     return direction, per_mm, path, angle / math.radians(laser.fan_angle_deg / 2)
 
 
-def _power_per_rad(laser: Laser, angle: np.ndarray) -> np.ndarray:
+def _compute_power_per_rad(laser: Laser, angle: np.ndarray) -> np.ndarray:
     """Return the described fraction of the power per rad at angles (N,) in air; 0 outside the fan."""
     half = math.radians(laser.fan_angle_deg / 2)
     if not (table := laser.fan_table()):
@@ -225,7 +225,7 @@ def _power_per_rad(laser: Laser, angle: np.ndarray) -> np.ndarray:
     return np.interp(angle, nodes, power / np.trapezoid(power, nodes), left=0.0, right=0.0)
 
 
-def _normals(
+def _estimate_normals(
     header: CaptureHeader, calibration: Calibration, point: np.ndarray, stage_mm: np.ndarray, good: np.ndarray
 ) -> np.ndarray:
     """Return the surface's normals (N, 3), camera frame, from the points of the whole scan; NaN where not good."""

@@ -23,10 +23,10 @@ _LEAST_OVERLAP = 0.3
 def rank_passes(problem: PassProblem, solution: PassSolution, lengths: np.ndarray) -> list[Forecast]:
     """Return the effect of further passes on lengths with derivatives (L, U), the most helpful one first."""
     known = CovarianceRoot.from_covariance(solution.covariance)
-    return rank_candidates(known, lengths, _candidates(problem, solution))
+    return rank_candidates(known, lengths, _list_candidates(problem, solution))
 
 
-def _candidates(problem: PassProblem, solution: PassSolution) -> Iterator[Candidate]:
+def _list_candidates(problem: PassProblem, solution: PassSolution) -> Iterator[Candidate]:
     cells = solution.cells
     places, normals = np.array([cell.middle_mm for cell in cells]), np.array([cell.normal for cell in cells])
     # The information and the mean row of all passes in a cell, and a typical pass's information.
@@ -34,7 +34,7 @@ def _candidates(problem: PassProblem, solution: PassSolution) -> Iterator[Candid
     each = weight / np.array([len(cell.passes) for cell in cells])
     rows = np.array([cell.mean_row for cell in cells])
     first = problem.passes[0]
-    for text, pose, single in _motions(first.pose[len(first.pose) // 2], places):
+    for text, pose, single in _list_motions(first.pose[len(first.pose) // 2], places):
         seen = _predict_view(problem, solution, pose, places)
         if seen is None or np.count_nonzero(seen[1]) < _LEAST_OVERLAP * len(cells):
             continue
@@ -47,7 +47,7 @@ def _candidates(problem: PassProblem, solution: PassSolution) -> Iterator[Candid
         yield Candidate(words=text, information=eliminate_others(information, count), pose=pose, single=single)
 
 
-def _motions(start: np.ndarray, places: np.ndarray) -> Iterator[tuple[str, np.ndarray, bool]]:
+def _list_motions(start: np.ndarray, places: np.ndarray) -> Iterator[tuple[str, np.ndarray, bool]]:
     """Iterate over motions from the first pass: text, pose (4, 4), and whether it is a single motion."""
     axes, middle = start[:3, :3], places.mean(axis=0)
     width = float(np.ptp((places - middle) @ axes[:, 1]))

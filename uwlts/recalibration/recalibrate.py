@@ -490,7 +490,7 @@ def summarise(problem: PassProblem, solution: PassSolution, prior: Calibration, 
     parts = problem.root.shape[1]
     covariance = solution.covariance[:parts, :parts]
     of_parameters = problem.root @ covariance @ problem.root.T
-    lengths, by_amplitudes = _lengths(problem, solution, moved)
+    lengths, by_amplitudes = _state_lengths(problem, solution, moved)
     changes = tuple(
         ParameterChange(key, float(a) + 0.0, float(s), float(b), float(t))  # no negative zero
         for key, a, s, b, t in zip(
@@ -515,7 +515,7 @@ def summarise(problem: PassProblem, solution: PassSolution, prior: Calibration, 
     )
 
 
-def _lengths(
+def _state_lengths(
     problem: PassProblem, solution: PassSolution, moved: StoredEstimate
 ) -> tuple[tuple[StatedLength, ...], np.ndarray]:
     """Return the uncertainties of lengths along Y and Z, and their derivatives (2, U) by all amplitudes."""

@@ -58,7 +58,7 @@ def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s:
     reach = int(np.ceil(2 * speed * _LARGEST_S / step))
     ways = step * np.arange(-reach, reach + 1)
     ways = ways[np.argsort(np.abs(ways), kind="stable")]
-    costs, relief = np.array([_cost(surface, backward, way) for way in ways]).T
+    costs, relief = np.array([_compute_cost(surface, backward, way) for way in ways]).T
     # Without relief, flat areas match at any shift.
     comparable = relief >= _LEAST_RELIEF * relief.max()
     if not relief.max() > 0:
@@ -91,7 +91,7 @@ def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s:
     return shift / (2 * speed), std / (2 * speed)
 
 
-def _cost(surface: "_CentreCurves", backward: "_CentreCurves", shift: float) -> tuple[float, float]:
+def _compute_cost(surface: "_CentreCurves", backward: "_CentreCurves", shift: float) -> tuple[float, float]:
     """Return the mean capped distance, px, of the backward pass at a shift, and the sum of squared slopes."""
     residual, slope, _ = surface.compare(backward, shift)
     if len(residual) < _FEWEST:

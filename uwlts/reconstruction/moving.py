@@ -171,7 +171,7 @@ def add_platform_uncertainty(
     if mount is not None:
         own = np.array(mount.covariance) if mount_covariance is None else mount_covariance
         root = CovarianceRoot.from_covariance(own).root
-        errors.append(_mount_errors(ride.poses, mount.transform()[:3, 3], root))
+        errors.append(_convert_mount_errors(ride.poses, mount.transform()[:3, 3], root))
         digest = sha256(mount.transform().tobytes() + own.tobytes()).hexdigest()[:16]
         shared[f"mount {digest}"] = np.eye(count + 6, 6, -count)
         if ride.rates is not None and mount.time_offset_std_s:
@@ -184,8 +184,8 @@ def add_platform_uncertainty(
             correlation_s = 0.0
         if correlation_s != 0:
             chosen = ErrorPatterns() if chosen is None else chosen
-            modes = _path_modes(ride, correlation_s) if chosen.of_path is None else chosen.of_path[:2]
-            of_path = _path_errors(ride, *modes)
+            modes = _make_path_modes(ride, correlation_s) if chosen.of_path is None else chosen.of_path[:2]
+            of_path = _make_path_errors(ride, *modes)
             if chosen.of_path is None:
                 some = sample_indices(len(frame))
                 shifts = propagate_pose_errors(of_path, frame[some], levers[some])
@@ -201,7 +201,7 @@ def add_platform_uncertainty(
     return replace(uncertainty, patterns_mm=patterns, poses_mm=poses_mm, shared=shared)
 
 
-def _mount_errors(poses: np.ndarray, place_mm: np.ndarray, root: np.ndarray) -> np.ndarray:
+def _convert_mount_errors(poses: np.ndarray, place_mm: np.ndarray, root: np.ndarray) -> np.ndarray:
     """Return errors (F, 6, K) of poses (F, 4, 4) that are equivalent to those of the mount by components, (6, K).
 
     A translation d and a rotation w of the mount move a point p by d + w x (p - t), all in the platform's frame. The
@@ -211,22 +211,22 @@ def _mount_errors(poses: np.ndarray, place_mm: np.ndarray, root: np.ndarray) -> 
     return np.concatenate([shifts - np.cross(turns, (poses[:, :3, :3] @ place_mm)[:, :, None], axis=1), turns], axis=1)
 
 
-def _path_modes(ride: PlatformPoses, correlation_s: float | None) -> tuple[np.ndarray, np.ndarray]:
+def _make_path_modes(ride: PlatformPoses, correlation_s: float | None) -> tuple[np.ndarray, np.ndarray]:
     """Return times (T,) of a path, and the temporal modes (K, T) of the errors of its poses."""
     assert ride.covariance is not None
     some = sample_indices(len(ride.times_s), _MOST_MOMENTS)
     times = ride.times_s[some]
-    return times, _temporal_modes(_pose_correlation(ride.covariance[some], times, correlation_s))
+    return times, _find_temporal_modes(_compute_pose_correlation(ride.covariance[some], times, correlation_s))
 
 
-def _path_errors(ride: PlatformPoses, times_s: np.ndarray, modes: np.ndarray) -> np.ndarray:
+def _make_path_errors(ride: PlatformPoses, times_s: np.ndarray, modes: np.ndarray) -> np.ndarray:
     """Return independent errors (F, 6, 6 K) of poses along a path, by temporal modes (K, T) at times (T,)."""
     assert ride.covariance is not None
     at = np.stack([np.interp(ride.times_s, times_s, mode) for mode in modes], axis=1)
     return (root_covariances(ride.covariance)[:, :, None] * at[:, None, :, None]).reshape(len(at), 6, -1)
 
 
-def _pose_correlation(covariances: np.ndarray, times_s: np.ndarray, correlation_s: float | None) -> np.ndarray:
+def _compute_pose_correlation(covariances: np.ndarray, times_s: np.ndarray, correlation_s: float | None) -> np.ndarray:
     """Return the correlation (F, F) of pose errors at times (F,)."""
     if correlation_s is not None:
         return np.exp(-np.abs(times_s[:, None] - times_s) / correlation_s)
@@ -238,7 +238,7 @@ def _pose_correlation(covariances: np.ndarray, times_s: np.ndarray, correlation_
     return np.exp(-np.abs(way[:, None] - way))
 
 
-def _temporal_modes(correlations: np.ndarray) -> np.ndarray:
+def _find_temporal_modes(correlations: np.ndarray) -> np.ndarray:
     """Return temporal modes (K, F) whose outer products sum to the correlation, up to a small remainder."""
     values, vectors = np.linalg.eigh(correlations)
     values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]

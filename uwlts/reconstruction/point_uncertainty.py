@@ -61,7 +61,7 @@ def estimate_stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.
     images, up to `MOST_CORRELATED`.
     """
     f, at, c, off, image = _compare_neighbours(frame, line, centre_px)
-    scale = _NEIGHBOUR_SCALE * min(_correlation(f, at, c, off), MOST_CORRELATED)
+    scale = _NEIGHBOUR_SCALE * min(_correlate(f, at, c, off), MOST_CORRELATED)
     noise = np.full(int(frame.max()) + 1, np.nan)
     starts = np.flatnonzero(np.r_[True, image[1:] != image[:-1], True])
     for start, end in pairwise(starts.tolist()):
@@ -78,7 +78,7 @@ def measure_correlation(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarr
     It is 1 for too few centres. The third difference of means of neighbouring lines has 20 times the variance of one
     mean. Parabolas have none.
     """
-    return _correlation(*_compare_neighbours(frame, line, centre_px)[:4])
+    return _correlate(*_compare_neighbours(frame, line, centre_px)[:4])
 
 
 def _compare_neighbours(
@@ -98,7 +98,7 @@ def _compare_neighbours(
     return f, at, c, off, f[1:-1][beside]
 
 
-def _correlation(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray, off: np.ndarray) -> float:
+def _correlate(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray, off: np.ndarray) -> float:
     """Return `measure_correlation` of sorted centres (N,) with distances (M,) from the means of two neighbours."""
     count, usual = 4 * _MEAN_LINES, _median(off)
     if len(line) < count or usual <= 0:
@@ -170,7 +170,7 @@ def point_uncertainty(
         )
     rigid = frame_by @ root[: frame_by.shape[1]]
     rigid[0, -1] = window_shift_std_mm(sensor) if mount_by is None else 0.0
-    exact = partial(_derivatives, known, root, rigid)
+    exact = partial(_compute_derivatives, known, root, rigid)
     of_estimate = tuple(array.tobytes() for array in (known.values, root, rigid))
     key = None if digest is None else ("uncertainty", digest, known.view, *of_estimate)
     table = LineTable.over_range(exact, line, centre_px, tolerance=_TABLE_TOLERANCE_MM, key=key)
@@ -285,7 +285,7 @@ def window_shift_std_mm(sensor: Sensor) -> float:
     return window.thickness_mm * (1 - 1 / window.index(sensor.laser.wavelength_nm)) * tilt if window.mounted else 0.0
 
 
-def _derivatives(
+def _compute_derivatives(
     known: StoredEstimate, root: np.ndarray, rigid: np.ndarray, line: np.ndarray, centre_px: np.ndarray
 ) -> np.ndarray:
     """Return the derivatives (N, 3 (1 + R)) of points by the pixel across the stripe and independent components.

@@ -165,7 +165,7 @@ class JointRegistration:
         common = group_markers(centres, _SPHERE_REACH * (self.sphere_mm or 0.0))
         pairs = {}
         for a, b in combinations(range(len(self.patches)), 2):
-            ways = _distances_both_ways(found, a, b) if _count_patches(found, a, b) >= FEWEST_OF_PAIR else []
+            ways = _measure_both_ways(found, a, b) if _count_patches(found, a, b) >= FEWEST_OF_PAIR else []
             shared = [(views[a], views[b], len(views)) for views in common if a in views and b in views]
             if ways or shared:
                 pairs[a, b] = self._pair_evidence(a, b, ways, others, shared)
@@ -208,7 +208,7 @@ class JointRegistration:
         known = values > LEAST_INFORMATION
         ways, strengths = vectors[:, known], values[known]
         open_ways = np.linalg.qr(vectors[:, np.logical_not(known)])[0]
-        off = self._offset_from_start()
+        off = self._compute_offset()
         if self.start_std is None:
             ways = ways - open_ways @ (open_ways.T @ ways)
             inverse, by, beforehand = (ways / strengths) @ ways.T, np.eye(count), np.zeros(count)
@@ -243,13 +243,13 @@ class JointRegistration:
             for source, target, found in pair.ways:
                 rows = pair.spread * weighted[first : first + len(found.source)]
                 first += len(found.source)
-                for number, by_errors in self._height_changes(source, target, found):
+                for number, by_errors in self._compute_height_changes(source, target, found):
                     changes[number] = changes.get(number, 0.0) + by_errors.T @ rows
         for each in changes.values():
             information += each.T @ each
         return solution.response @ information @ solution.response.T + solution.by_prior
 
-    def _height_changes(self, source: int, target: int, found: PatchDistances) -> list[tuple[int, csr_array]]:
+    def _compute_height_changes(self, source: int, target: int, found: PatchDistances) -> list[tuple[int, csr_array]]:
         """Return the changes (Q, E) of distances by the independent errors of both scans, with the scans' numbers."""
         errors = self.patches[source].errors[found.source]
         # Without a known side, the normals of both surfaces may have opposite signs.
@@ -343,7 +343,7 @@ class JointRegistration:
                 block[:, columns] = sign * rigid_derivatives(places, directions, middles[number])
         return block
 
-    def _offset_from_start(self) -> np.ndarray:
+    def _compute_offset(self) -> np.ndarray:
         """Return the translations and rotations (P,) of the poses relative to the initial poses."""
         turned = Rotation.from_matrix(self.poses[1:, :3, :3] @ self.start[1:, :3, :3].transpose(0, 2, 1)).as_rotvec()
         return np.hstack([(self.middles_mm - self._start_middles_mm)[1:], turned]).ravel()
@@ -417,7 +417,7 @@ def fit_pair(source: Patches, target: Patches, start: np.ndarray) -> tuple[np.nd
     return joint.poses[1], distances_between(source, joint.poses[1], target, np.eye(4), reach_mm=reach)
 
 
-def _distances_both_ways(
+def _measure_both_ways(
     found: dict[tuple[int, int], PatchDistances], a: int, b: int
 ) -> list[tuple[int, int, PatchDistances]]:
     """Return source, target and distances of two scans in both directions, where they overlap."""
@@ -426,7 +426,7 @@ def _distances_both_ways(
 
 def _count_patches(found: dict[tuple[int, int], PatchDistances], a: int, b: int) -> int:
     """Count the patches in the overlap of two scans."""
-    return sum(len(distances.source) for *_, distances in _distances_both_ways(found, a, b))
+    return sum(len(distances.source) for *_, distances in _measure_both_ways(found, a, b))
 
 
 def _compute_prior_information(patterns: Sequence[np.ndarray], shared: Sequence[dict[str, np.ndarray]]) -> np.ndarray:

@@ -36,7 +36,7 @@ def merge_clouds(
             random[here] = rotate_covariances(known.random_mm2, rotation)
             position[here] = known.position_mm @ rotation.T
         points[here] = places @ rotation.T + joint.poses[number, :3, 3]
-    patterns = _joint_patterns(scans, np.split(points, ends[:-1]), joint, covariance)
+    patterns = _find_joint_patterns(scans, np.split(points, ends[:-1]), joint, covariance)
     times = [scan.time_s for scan in scans if scan.time_s is not None]
     return PointCloud(
         points_mm=points,
@@ -62,7 +62,7 @@ def _rotate_image_poses(scans: Sequence[PointCloud], joint: JointRegistration) -
     return np.concatenate(parts, axis=1)
 
 
-def _joint_patterns(
+def _find_joint_patterns(
     scans: Sequence[PointCloud], points: Sequence[np.ndarray], joint: JointRegistration, covariance: np.ndarray
 ) -> np.ndarray:
     """Return patterns (M, N, 3), orthogonal over all points, of the joint covariance of poses and patterns."""

@@ -352,7 +352,7 @@ def _pair_fit(
         mean_mm=float(np.mean(counted)) if len(counted) else 0.0,
         rms_mm=float(np.sqrt(np.mean(counted**2))) if len(counted) else 0.0,
         scatter=pair.spread,
-        closure_mm=_closure_rms(joint, key, pairs, solution) if len(counted) else None,
+        closure_mm=_compute_closure_rms(joint, key, pairs, solution) if len(counted) else None,
         spheres=pair.spheres,
         # Sphere residuals are whitened, so that they are relative to their uncertainty.
         sphere_rms=float(np.sqrt(np.mean(centres**2))) if pair.spheres else None,
@@ -395,7 +395,7 @@ def _orient(direction: np.ndarray) -> np.ndarray:
     return unit * np.sign(unit[np.argmax(np.abs(unit))])
 
 
-def _closure_rms(
+def _compute_closure_rms(
     joint: JointRegistration, key: tuple[int, int], pairs: dict[tuple[int, int], PairEvidence], solution: PoseSolution
 ) -> float | None:
     """Return the rms distance that remains in an overlap if all other pairs determine the poses.

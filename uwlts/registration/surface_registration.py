@@ -69,7 +69,7 @@ class Registration:
 
     def std_along(self, points_mm: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Return the standard uncertainty (N,), mm, of moved points (N, 3) along normals, without shared patterns."""
-        by = _motion_derivatives(points_mm, normals, self.middle_mm, sized=len(self.covariance) == 7)
+        by = _differentiate_by_motion(points_mm, normals, self.middle_mm, sized=len(self.covariance) == 7)
         return np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", by, self.covariance, by), 0.0))
 
     def moves_mm(self, step: np.ndarray, points_mm: np.ndarray, normals: np.ndarray | None = None) -> np.ndarray:
@@ -137,7 +137,7 @@ def shape_registration(
     """
     points_mm, uncertainty = cloud.points_mm, cloud.uncertainty
     middle = points_mm.mean(axis=0)
-    by = _motion_derivatives(points_mm, normals, middle, sized=sized)
+    by = _differentiate_by_motion(points_mm, normals, middle, sized=sized)
     # Rotations are scaled by the rms radius, so that all unknowns are lengths.
     units = np.array([1.0] * 3 + [1 / max(rms_distance(points_mm, middle), 1e-9)] * 3 + [1.0] * sized)
     values, vectors = np.linalg.eigh((by * units).T @ (by * units))
@@ -162,7 +162,7 @@ def select_within(points: np.ndarray, datums: np.ndarray) -> np.ndarray:
     return np.any(np.linalg.norm(points[:, None] - datums[:, :3], axis=2) <= datums[:, 3], axis=1)
 
 
-def _motion_derivatives(points: np.ndarray, normals: np.ndarray, middle: np.ndarray, *, sized: bool) -> np.ndarray:
+def _differentiate_by_motion(points: np.ndarray, normals: np.ndarray, middle: np.ndarray, *, sized: bool) -> np.ndarray:
     """Return the derivatives (N, 6) of distances by translation and rotation, or (N, 7) with the radius."""
     by = rigid_derivatives(points, normals, middle)
     return np.hstack([by, np.ones((len(by), 1))]) if sized else by

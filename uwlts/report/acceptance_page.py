@@ -77,17 +77,17 @@ def acceptance_page(acceptance: Acceptance) -> str:
         colour=_DECISIONS.get(acceptance.verdict, "open"),
         acceptance=acceptance,
         rule=RULES[plan.decision_rule],
-        characteristics=[_characteristic_row(each) for each in acceptance.characteristics],
+        characteristics=[_make_characteristic_row(each) for each in acceptance.characteristics],
         limits=_draw_limits(acceptance) if acceptance.values else None,
         places=_draw_places(acceptance) if acceptance.values else None,
         lengths=_draw_lengths(acceptance) if any(value.length_mm for value in acceptance.values) else None,
         positions=[_position_row(number, each, measured) for number, each in enumerate(acceptance.positions, start=1)],
         measured=measured,
-        artefacts=[_artefact_row(name, each) for name, each in plan.artefacts.items()],
+        artefacts=[_make_artefact_row(name, each) for name, each in plan.artefacts.items()],
     )
 
 
-def _characteristic_row(each: Characteristic) -> tuple[str, ...]:
+def _make_characteristic_row(each: Characteristic) -> tuple[str, ...]:
     text, guideline = NAMES[each.symbol]
     worst = each.worst
     value = MISSING if worst is None else format_fixed(worst.value_mm, 4, signed=each.symbol in _SIGNED)
@@ -110,17 +110,17 @@ def _position_row(number: int, each: JudgedPosition, measured: Sequence[Symbol])
     return f"{number}", each.name, each.artefact, state, points, *values
 
 
-def _artefact_row(name: str, each: CertifiedArtefact) -> tuple[str, ...]:
+def _make_artefact_row(name: str, each: CertifiedArtefact) -> tuple[str, ...]:
     standard = each.standard
     sizes = MISSING
     if isinstance(standard, SphereStandard):
         diameters = ", ".join(f"{diameter:g}" for diameter in standard.diameters_mm)
-        sizes = f"diameters {diameters} ± {_stated(standard.diameter_uncertainty_mm)}"
+        sizes = f"diameters {diameters} ± {_format_stated(standard.diameter_uncertainty_mm)}"
         if standard.spacings_mm:
             spacings = ", ".join(f"{s:g}" for s in standard.spacings_mm)
-            sizes += f"; spacings {spacings} ± {_stated(standard.spacing_uncertainty_mm)}"
+            sizes += f"; spacings {spacings} ± {_format_stated(standard.spacing_uncertainty_mm)}"
     elif isinstance(standard, StepStandard):
-        sizes = f"height {standard.height_mm:g} ± {_stated(standard.height_uncertainty_mm)}"
+        sizes = f"height {standard.height_mm:g} ± {_format_stated(standard.height_uncertainty_mm)}"
     form = MISSING if each.stated_form_mm() is None else f"{each.stated_form_mm():g} ± {each.form_uncertainty_mm:g}"
     expansion = "not stated"
     if each.expansion_per_k is not None:
@@ -128,7 +128,7 @@ def _artefact_row(name: str, each: CertifiedArtefact) -> tuple[str, ...]:
     return name, each.certificate or "not stated", sizes, form, f"{each.alignment_uncertainty_mm:g}", expansion
 
 
-def _stated(value: float | None) -> str:
+def _format_stated(value: float | None) -> str:
     return "not stated" if value is None else f"{value:g}"
 
 

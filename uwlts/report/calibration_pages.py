@@ -73,7 +73,7 @@ def write_camera(path: str | Path, camera: CameraCalibration, *, overwrite: bool
         "uwlts.report",
         "camera.html.j2",
         name=camera.folder.resolve().name,
-        summary=_summary(camera),
+        summary=_summarise(camera),
         models=models,
         rows=rows,
         misses=_plot_residuals(camera),
@@ -91,12 +91,12 @@ def camera_lines(camera: CameraCalibration) -> list[str]:
         f"  {each.options.name:32} {each.rms_px:8.4f} px" + ("   taken" if each.options == taken else "")
         for each in camera.lens.candidates
     ]
-    return _summary(camera) + (
+    return _summarise(camera) + (
         ["models, misses of images that each was not calibrated from:", *models] if models else []
     )
 
 
-def _summary(camera: CameraCalibration) -> list[str]:
+def _summarise(camera: CameraCalibration) -> list[str]:
     """Return images used, residuals, and the parameters with their standard uncertainties, as lines of text."""
     lens = camera.lens
     lines = [

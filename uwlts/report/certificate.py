@@ -230,7 +230,7 @@ def make_certificate(calibration: Calibration, path: str | Path, *, issued: str)
         wavelength_nm=calibration.wavelength_nm,
         made_from=calibration.provenance,
         parameters=parameter_rows(calibration),
-        validity=tuple(_validity(prepare_use(calibration, region)) for region in found),
+        validity=tuple(_describe_validity(prepare_use(calibration, region)) for region in found),
         scatter_px=joint.scatter_px,
         shared_variance=joint.shared_variance,
         residuals=joint.residual_count,
@@ -250,7 +250,7 @@ def make_certificate(calibration: Calibration, path: str | Path, *, issued: str)
             "lengths_std_mm": float(np.sqrt(np.mean(lengths.std_mm(known.covariance) ** 2))),
             "cannot_tell": tuple(format_weaknesses(weak)),
             "weaknesses": tuple(weak),
-            "next_shots": _shots(rank_next_shots(calibration)),
+            "next_shots": _list_best_shots(rank_next_shots(calibration)),
         }
     content = content.model_copy(update=added)
     return content.model_copy(update={SEAL: compute_seal(content.in_file())})
@@ -273,7 +273,7 @@ def certificate_lines(content: Certificate) -> list[str]:
     ]
 
 
-def _shots(forecasts: Sequence[Forecast]) -> tuple[NextShot, ...]:
+def _list_best_shots(forecasts: Sequence[Forecast]) -> tuple[NextShot, ...]:
     """Return the best shots, and the best of each kind, in order."""
     kinds = [each.candidate.words.split(",")[0] for each in forecasts]
     return tuple(
@@ -285,7 +285,7 @@ def _shots(forecasts: Sequence[Forecast]) -> tuple[NextShot, ...]:
     )
 
 
-def _validity(use: CalibrationInUse) -> Validity:
+def _describe_validity(use: CalibrationInUse) -> Validity:
     region, known, index = use.region, use.known, index_key(use.known)
     low, high = region.outline_mm.min(axis=0), region.outline_mm.max(axis=0)
     return Validity(

@@ -131,11 +131,11 @@ def certificate_page(
         captures=[source.in_file() for source in Origin.model_validate(content.made_from).captures()],
         warnings=content.made_from.get("warnings", []),
         known_before=content.made_from.get("known_before", {}),
-        parameters=_parameters(content.parameters, before),
+        parameters=_list_parameters(content.parameters, before),
         before=None if before is None else before[0],
         equipment=administration.equipment if administration is not None else (),
         traceability=state_traceability(content, administration)[1],
-        lengths=_length_rows(content.lengths),
+        lengths=_list_lengths(content.lengths),
         drawn=_pictures(content, calibration, before),
     )
 
@@ -169,7 +169,7 @@ def _pictures(content: Certificate, calibration: Calibration, before: tuple[str,
     return drawn
 
 
-def _parameters(rows: Sequence[ParameterRow], before: tuple[str, Calibration] | None) -> list[tuple[str, ...]]:
+def _list_parameters(rows: Sequence[ParameterRow], before: tuple[str, Calibration] | None) -> list[tuple[str, ...]]:
     """Return words, unit, value, standard and prior uncertainty, then both values of the other calibration."""
     other = {} if before is None else {row.name: row for row in parameter_rows(before[1])}
     shown = []
@@ -180,7 +180,7 @@ def _parameters(rows: Sequence[ParameterRow], before: tuple[str, Calibration] | 
     return shown + [(row.words, row.unit, MISSING, MISSING, MISSING, *row.texts()) for row in other.values()]
 
 
-def _length_rows(lengths: Sequence[LengthUncertainty]) -> list[tuple[float, list[tuple[str, str]]]]:
+def _list_lengths(lengths: Sequence[LengthUncertainty]) -> list[tuple[float, list[tuple[str, str]]]]:
     """Return lengths with expanded uncertainties in µm along X, Y and Z; a dash if the length does not fit."""
     table = {
         (r.length_mm, r.axis): (format_fixed(1e3 * r.calibration_mm, 1), format_fixed(1e3 * r.point_mm, 1))

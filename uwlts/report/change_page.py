@@ -90,7 +90,7 @@ def write_change(
         regions=change.regions()[:_MOST_ROWS],
         more=max(len(change.regions()) - _MOST_ROWS, 0),
         map=_map(change),
-        histogram=_histogram(change),
+        histogram=_draw_histogram(change),
     )
     if coloured is not None:
         _write_places(Path(coloured), change, overwrite=overwrite)
@@ -102,7 +102,7 @@ def _write_places(path: Path, change: SurfaceChange, *, overwrite: bool) -> None
     fields = dict(zip(("nx", "ny", "nz"), change.normals.T.astype(np.float32), strict=True))
     fields |= {"distance": change.distance_mm.astype(np.float32), "level": change.level_mm.astype(np.float32)}
     fields["significant"] = change.significant.astype(np.uint8)
-    colours = _colours(change)
+    colours = _colour_points(change)
     if path.suffix.lower() == ".ply":
         places = dict(zip("xyz", change.points_mm.T, strict=True)) | dict(zip(PLY_COLOURS, colours.T, strict=True))
         write_ply_points(path, places | fields, overwrite=overwrite)
@@ -113,7 +113,7 @@ def _write_places(path: Path, change: SurfaceChange, *, overwrite: bool) -> None
     write_file(path, content, overwrite=overwrite)
 
 
-def _colours(change: SurfaceChange) -> np.ndarray:
+def _colour_points(change: SurfaceChange) -> np.ndarray:
     """Return red, green and blue (P, 3) uint8 of the points, as on the map; `UNKNOWN` if not compared."""
     limit = surface_limit_mm(change.distance_mm[change.compared])
     colours = _COLOURS((np.nan_to_num(change.distance_mm) / limit + 1) / 2, bytes=True)[:, :3]
@@ -149,7 +149,7 @@ def _map(change: SurfaceChange) -> str:
     return png_data_uri(axes, dpi=130)
 
 
-def _histogram(change: SurfaceChange) -> Markup:
+def _draw_histogram(change: SurfaceChange) -> Markup:
     distance, level = change.distance_mm[change.compared], change.level_mm[change.compared]
     limit = surface_limit_mm(distance)
     figure, (axes,) = new_figure(9.0, 3.2)
@@ -197,14 +197,14 @@ def write_registration(
         first=registered.names[0],
         summary=[line for line in registered.lines() if not line.startswith("  open")],
         open_movements=[(registered.names[each.scan], each.describe()) for each in registered.open_movements],
-        scans=_scans(registered),
-        overlaps=_overlaps(registered),
-        histograms=_histograms(registered),
+        scans=_draw_scans(registered),
+        overlaps=_draw_overlaps(registered),
+        histograms=_draw_histograms(registered),
     )
     write_page(path, text, beside=json_text(registered.record()), kind=REGISTRATION, overwrite=overwrite)
 
 
-def _scans(registered: RegisteredScans) -> str:
+def _draw_scans(registered: RegisteredScans) -> str:
     listed: Any = registered.cloud.metadata["scans"]
     firsts = [each["first_frame"] for each in listed]
     number = np.searchsorted(firsts, registered.cloud.frame, side="right") - 1
@@ -223,7 +223,7 @@ def _scans(registered: RegisteredScans) -> str:
     return draw_views(draw)
 
 
-def _overlaps(registered: RegisteredScans) -> str:
+def _draw_overlaps(registered: RegisteredScans) -> str:
     places = np.vstack([each.places_mm for each in registered.overlaps])
     distance = np.concatenate([each.distance_mm for each in registered.overlaps])
     limit = surface_limit_mm(distance)
@@ -251,7 +251,7 @@ def draw_views(
     return png_data_uri(figure, dpi=130)
 
 
-def _histograms(registered: RegisteredScans) -> Markup:
+def _draw_histograms(registered: RegisteredScans) -> Markup:
     count = len(registered.pairs)
     columns = min(count, 3)
     figure, axes = new_figure(9.0, 2.0 * -(-count // columns), rows=-(-count // columns), columns=columns)

@@ -151,8 +151,8 @@ def digital_certificate(content: Certificate, administration: Administration) ->
         ET.register_namespace(prefix, uri)
     root = ET.Element(f"{{{DCC}}}digitalCalibrationCertificate", {"schemaVersion": SCHEMA_VERSION})
     root.set(f"{{{_XSI}}}schemaLocation", f"{DCC} {_SCHEMA}")
-    _add_administration(_child(root, "administrativeData"), content, administration)
-    _add_results(_child(_child(root, "measurementResults"), "measurementResult"), content, administration)
+    _add_administration(_add_child(root, "administrativeData"), content, administration)
+    _add_results(_add_child(_add_child(root, "measurementResults"), "measurementResult"), content, administration)
     ET.indent(root)
     return ET.tostring(root, encoding="unicode", xml_declaration=False).join(
         ('<?xml version="1.0" encoding="UTF-8"?>\n', "\n")
@@ -160,49 +160,49 @@ def digital_certificate(content: Certificate, administration: Administration) ->
 
 
 def _add_administration(parent: ET.Element, content: Certificate, stated: Administration) -> None:
-    software = _child(_child(parent, "dccSoftware"), "software")
+    software = _add_child(_add_child(parent, "dccSoftware"), "software")
     program, _, release = content.software.partition(" ")
-    _text(software, "name", program)
-    _child(software, "release", release or "unknown")
-    core = _child(parent, "coreData")
-    _child(core, "countryCodeISO3166_1", stated.laboratory.country)
-    _child(core, "usedLangCodeISO639_1", _LANGUAGE)
-    _child(core, "mandatoryLangCodeISO639_1", _LANGUAGE)
-    _child(core, "uniqueIdentifier", stated.identifier)
-    _child(core, "beginPerformanceDate", stated.begin.isoformat())
-    _child(core, "endPerformanceDate", stated.end.isoformat())
-    _child(core, "performanceLocation", stated.location)
-    _child(core, "issueDate", content.issued[:10])
-    item = _child(_child(parent, "items"), "item")
-    _text(item, "name", content.sensor)
-    _text(_child(item, "manufacturer"), "name", stated.item.manufacturer)
+    _add_text(software, "name", program)
+    _add_child(software, "release", release or "unknown")
+    core = _add_child(parent, "coreData")
+    _add_child(core, "countryCodeISO3166_1", stated.laboratory.country)
+    _add_child(core, "usedLangCodeISO639_1", _LANGUAGE)
+    _add_child(core, "mandatoryLangCodeISO639_1", _LANGUAGE)
+    _add_child(core, "uniqueIdentifier", stated.identifier)
+    _add_child(core, "beginPerformanceDate", stated.begin.isoformat())
+    _add_child(core, "endPerformanceDate", stated.end.isoformat())
+    _add_child(core, "performanceLocation", stated.location)
+    _add_child(core, "issueDate", content.issued[:10])
+    item = _add_child(_add_child(parent, "items"), "item")
+    _add_text(item, "name", content.sensor)
+    _add_text(_add_child(item, "manufacturer"), "name", stated.item.manufacturer)
     if stated.item.model is not None:
-        _child(item, "model", stated.item.model)
-    identifications = _child(item, "identifications")
+        _add_child(item, "model", stated.item.model)
+    identifications = _add_child(item, "identifications")
     _identify(identifications, "manufacturer", stated.item.serial_number, "serial number", "basic_serialNumber")
     _identify(identifications, "other", content.calibration.sha256, "SHA-256 of the calibration file")
     _identify(identifications, "other", content.calibration.digest, "identifier of the calibration in clouds")
     if content.sha256:
         _identify(identifications, "other", content.sha256, "SHA-256 of the sealed certificate (JSON)")
-    _add_contact(_child(_child(parent, "calibrationLaboratory"), "contact"), stated.laboratory)
-    persons = _child(parent, "respPersons")
+    _add_contact(_add_child(_add_child(parent, "calibrationLaboratory"), "contact"), stated.laboratory)
+    persons = _add_child(parent, "respPersons")
     for each in stated.persons:
-        person = _child(persons, "respPerson")
-        _text(_child(person, "person"), "name", each.name)
+        person = _add_child(persons, "respPerson")
+        _add_text(_add_child(person, "person"), "name", each.name)
         if each.role is not None:
-            _child(person, "role", each.role)
-        _child(person, "mainSigner", str(each.main_signer).lower())
-    _add_contact(_child(parent, "customer"), stated.customer)
-    statements = _child(parent, "statements")
+            _add_child(person, "role", each.role)
+        _add_child(person, "mainSigner", str(each.main_signer).lower())
+    _add_contact(_add_child(parent, "customer"), stated.customer)
+    statements = _add_child(parent, "statements")
     traceable, sentence = state_traceability(content, stated)
-    statement = _child(statements, "statement")
-    _child(statement, "traceable", str(traceable).lower())
-    _text(statement, "declaration", sentence)
-    for text in _statements(content):
-        _text(_child(statements, "statement"), "declaration", text)
+    statement = _add_child(statements, "statement")
+    _add_child(statement, "traceable", str(traceable).lower())
+    _add_text(statement, "declaration", sentence)
+    for text in _list_statements(content):
+        _add_text(_add_child(statements, "statement"), "declaration", text)
 
 
-def _statements(content: Certificate) -> Iterator[str]:
+def _list_statements(content: Certificate) -> Iterator[str]:
     yield (
         "Uncertainties are expanded uncertainties with the coverage factor k = 2, for a coverage probability of about "
         "95 % with a normal distribution (GUM, JCGM 100:2008)."
@@ -214,31 +214,31 @@ def _statements(content: Certificate) -> Iterator[str]:
 
 
 def _add_results(parent: ET.Element, content: Certificate, stated: Administration) -> None:
-    _text(parent, "name", f"Calibration of {content.sensor}")
-    method = _child(_child(parent, "usedMethods"), "usedMethod")
+    _add_text(parent, "name", f"Calibration of {content.sensor}")
+    method = _add_child(_add_child(parent, "usedMethods"), "usedMethod")
     method.set("refType", "basic_methodMeasurementUncertainty")
-    _text(method, "name", "joint calibration of camera, window and laser sheet")
-    _child(method, "norm", "JCGM 100:2008")
+    _add_text(method, "name", "joint calibration of camera, window and laser sheet")
+    _add_child(method, "norm", "JCGM 100:2008")
     if stated.equipment:
-        _add_equipment(_child(parent, "measuringEquipments"), stated)
+        _add_equipment(_add_child(parent, "measuringEquipments"), stated)
     if content.validity:
-        _add_medium(_child(parent, "influenceConditions"), content)
-    results = _child(parent, "results")
-    parameters = _result(results, "Parameters")
+        _add_medium(_add_child(parent, "influenceConditions"), content)
+    results = _add_child(parent, "results")
+    parameters = _add_result(results, "Parameters")
     for row in content.parameters:
         if row.unit not in UNITS:
             raise EvaluationError(f"the unit {row.unit!r} of {row.name} is none of {', '.join(map(repr, UNITS))}")
         text = f"{row.words} ({row.name}){' in pixels' if row.unit == 'px' else ''}"
         _quantity(parameters, text, row.value, UNITS[row.unit], None if row.std is None else 2 * row.std)
     if content.lengths:
-        lengths = _result(results, "Lengths measured on surfaces of many points")
-        points = _result(results, "Lengths between two single points")
+        lengths = _add_result(results, "Lengths measured on surfaces of many points")
+        points = _add_result(results, "Lengths between two single points")
         for each in content.lengths:
             text = f"length of {each.length_mm:g} mm along {each.axis}"
             for group, expanded in ((lengths, each.calibration_mm), (points, each.point_mm)):
                 _quantity(group, text, each.length_mm, UNITS["mm"], expanded, "basic_nominalValue")
     if content.validity:
-        volume = _result(results, "Volume")
+        volume = _add_result(results, "Volume")
         for region in content.validity:
             ends = {"distance from the pupil": region.camera_depth_mm, "Y": region.y_mm, "Z": region.z_mm}
             for text, pair in ends.items():
@@ -248,19 +248,19 @@ def _add_results(parent: ET.Element, content: Certificate, stated: Administratio
 
 def _add_equipment(parent: ET.Element, stated: Administration) -> None:
     for each in stated.equipment:
-        equipment = _child(parent, "measuringEquipment")
+        equipment = _add_child(parent, "measuringEquipment")
         equipment.set("refType", "basic_measurementStandard")
-        _text(equipment, "name", f"{each.role}: {each.name}")
+        _add_text(equipment, "name", f"{each.role}: {each.name}")
         if each.manufacturer is not None:
-            _text(_child(equipment, "manufacturer"), "name", each.manufacturer)
+            _add_text(_add_child(equipment, "manufacturer"), "name", each.manufacturer)
         if each.model is not None:
-            _child(equipment, "model", each.model)
+            _add_child(equipment, "model", each.model)
         numbers = [
             ("manufacturer", each.serial_number, "serial number", "basic_serialNumber"),
             ("calibrationLaboratory", each.certificate, "certificate", "basic_certificateIdentifier"),
         ]
         if any(value is not None for _, value, *_ in numbers):
-            identifications = _child(equipment, "identifications")
+            identifications = _add_child(equipment, "identifications")
             for issuer, value, text, kind in numbers:
                 if value is not None:
                     _identify(identifications, issuer, value, text, kind)
@@ -268,42 +268,42 @@ def _add_equipment(parent: ET.Element, stated: Administration) -> None:
 
 def _add_medium(parent: ET.Element, content: Certificate) -> None:
     for region in content.validity:
-        condition = _child(parent, "influenceCondition")
-        _text(condition, "name", f"medium {region.name}: {region.medium.kind}")
-        data = _child(condition, "data")
+        condition = _add_child(parent, "influenceCondition")
+        _add_text(condition, "name", f"medium {region.name}: {region.medium.kind}")
+        data = _add_child(condition, "data")
         expanded = None if region.index_std is None else 2 * region.index_std
         _quantity(data, "refractive index relative to air", region.index, UNITS[""], expanded)
         if region.medium.kind in ("fresh", "sea"):
             _quantity(data, "temperature", region.medium.temperature_c, r"\degreecelsius", None, "basic_temperature")
 
 
-def _result(parent: ET.Element, text: str) -> ET.Element:
-    result = _child(parent, "result")
-    _text(result, "name", text)
-    return _child(result, "data")
+def _add_result(parent: ET.Element, text: str) -> ET.Element:
+    result = _add_child(parent, "result")
+    _add_text(result, "name", text)
+    return _add_child(result, "data")
 
 
 def _quantity(
     parent: ET.Element, text: str, value: float, unit: str, expanded: float | None, kind: str = "basic_measuredValue"
 ) -> None:
     """Add a real quantity of a ``kind`` (refType) with its expanded uncertainty, if known."""
-    quantity = _child(parent, "quantity")
+    quantity = _add_child(parent, "quantity")
     quantity.set("refType", kind)
-    _text(quantity, "name", text)
+    _add_text(quantity, "name", text)
     real = ET.SubElement(quantity, f"{{{SI}}}real")
     known = expanded is not None and expanded > 0
-    ET.SubElement(real, f"{{{SI}}}value").text = _decimal(value, expanded if known else None)
+    ET.SubElement(real, f"{{{SI}}}value").text = _format_decimal(value, expanded if known else None)
     ET.SubElement(real, f"{{{SI}}}unit").text = unit
     if expanded is not None:
         uncertainty = ET.SubElement(real, f"{{{SI}}}expandedUnc")
         factor, probability = _COVERAGE
-        ET.SubElement(uncertainty, f"{{{SI}}}uncertainty").text = _decimal(expanded, expanded if known else None)
+        ET.SubElement(uncertainty, f"{{{SI}}}uncertainty").text = _format_decimal(expanded, expanded if known else None)
         ET.SubElement(uncertainty, f"{{{SI}}}coverageFactor").text = factor
         ET.SubElement(uncertainty, f"{{{SI}}}coverageProbability").text = probability
         ET.SubElement(uncertainty, f"{{{SI}}}distribution").text = "normal"
 
 
-def _decimal(value: float, expanded: float | None) -> str:
+def _format_decimal(value: float, expanded: float | None) -> str:
     """Return a number in the form of D-SI, with the digits of two significant ones of its uncertainty (GUM 7.2.6).
 
     Without an uncertainty it has nine significant digits.
@@ -316,10 +316,10 @@ def _decimal(value: float, expanded: float | None) -> str:
 
 
 def _add_contact(parent: ET.Element, contact: Contact) -> None:
-    _text(parent, "name", contact.name)
+    _add_text(parent, "name", contact.name)
     if contact.e_mail is not None:
-        _child(parent, "eMail", contact.e_mail)
-    location = _child(parent, "location")
+        _add_child(parent, "eMail", contact.e_mail)
+    location = _add_child(parent, "location")
     given = {
         "city": contact.city,
         "countryCode": contact.country,
@@ -328,19 +328,19 @@ def _add_contact(parent: ET.Element, contact: Contact) -> None:
     }
     for name, text in given.items():
         if text is not None:
-            _child(location, name, text)
+            _add_child(location, name, text)
 
 
 def _identify(parent: ET.Element, issuer: str, value: str, text: str, kind: str | None = None) -> None:
-    identification = _child(parent, "identification")
+    identification = _add_child(parent, "identification")
     if kind is not None:
         identification.set("refType", kind)
-    _child(identification, "issuer", issuer)
-    _child(identification, "value", value)
-    _text(identification, "name", text)
+    _add_child(identification, "issuer", issuer)
+    _add_child(identification, "value", value)
+    _add_text(identification, "name", text)
 
 
-def _child(parent: ET.Element, name: str, text: str | None = None) -> ET.Element:
+def _add_child(parent: ET.Element, name: str, text: str | None = None) -> ET.Element:
     child = ET.SubElement(parent, f"{{{DCC}}}{name}")
     if text is not None:
         # XML 1.0 cannot contain other characters.
@@ -348,9 +348,9 @@ def _child(parent: ET.Element, name: str, text: str | None = None) -> ET.Element
     return child
 
 
-def _text(parent: ET.Element, name: str, text: str) -> None:
+def _add_text(parent: ET.Element, name: str, text: str) -> None:
     """Add an element with a text in the language of the certificate."""
-    content = _child(_child(parent, name), "content", text)
+    content = _add_child(_add_child(parent, name), "content", text)
     content.set("lang", _LANGUAGE)
 
 

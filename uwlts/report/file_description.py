@@ -163,7 +163,7 @@ def describe(path: str | Path, *, unit: Unit | None = None, pose_format: PoseFor
         lines = truth_lines(*read_truth(path))
     else:
         try:
-            lines = _lines_of(read(path, unit=unit, pose_format=pose_format))
+            lines = _describe_content(read(path, unit=unit, pose_format=pose_format))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise CaptureError(f"{path} is damaged: a value is missing or not a number ({error})") from error
     return "\n".join(lines)
@@ -182,7 +182,7 @@ def _name_description(path: Path) -> list[str]:
     return []
 
 
-def _lines_of(found: object) -> list[str]:
+def _describe_content(found: object) -> list[str]:
     match found:
         case Capture():
             with found:
@@ -261,12 +261,12 @@ def trajectory_lines(path: Trajectory) -> list[str]:
     lines = [f"trajectory of {len(path.times_s)} poses from {ends[0]} to {ends[1]}"]
     lines += [f"{axis}: {a:.3f} to {b:.3f} mm" for axis, a, b in zip("XYZ", low, high, strict=True)]
     for which, pose in (("first", path.poses[0]), ("last", path.poses[-1])):
-        axes = (f"{axis} along {_direction(pose[:3, k])}" for k, axis in enumerate("xyz"))
+        axes = (f"{axis} along {_describe_direction(pose[:3, k])}" for k, axis in enumerate("xyz"))
         lines.append(f"axes of the platform in the {which} pose: {', '.join(axes)}")
     return lines
 
 
-def _direction(vector: np.ndarray) -> str:
+def _describe_direction(vector: np.ndarray) -> str:
     """Return a unit vector as the base's axis that is nearest, with the angle from it."""
     nearest = int(np.argmax(np.abs(vector)))
     angle = np.degrees(np.arccos(min(1.0, abs(vector[nearest]))))
@@ -297,18 +297,18 @@ def calibration_lines(calibration: Calibration) -> list[str]:
         lines.append(
             f"window: {window.refractions} refraction(s), {window.distance_mm:.3f} mm from the entrance pupil{glass}"
         )
-    lines += _figure_lines(
+    lines += _list_figures(
         calibration, camera=("rms_px", "camera residual: {:.4f} px"), sheet=("rms_mm", "sheet residual: {:.4f} mm")
     )
-    lines += _image_lines(calibration.figures("camera"), calibration.figures("sheet"))
-    lines += _parameter_lines(calibration)
+    lines += _list_images(calibration.figures("camera"), calibration.figures("sheet"))
+    lines += _list_parameters(calibration)
     if (joint := calibration.joint) is not None:
         scatter = ", ".join(f"{kind} {value:.3f} px" for kind, value in joint.scatter_px.items())
         lines.append(f"scatter: {scatter}; {joint.outlier_count} of {joint.residual_count} residuals left out")
     return lines
 
 
-def _image_lines(camera: Mapping[str, JsonValue], sheet: Mapping[str, JsonValue]) -> list[str]:
+def _list_images(camera: Mapping[str, JsonValue], sheet: Mapping[str, JsonValue]) -> list[str]:
     """Describe the lens model and the result of each target image; empty if the calibration does not contain them."""
     table = camera.get("image_table")
     if not isinstance(table, list):
@@ -335,7 +335,7 @@ def _image_lines(camera: Mapping[str, JsonValue], sheet: Mapping[str, JsonValue]
     return lines + ([f"by every second image and by the others: {', '.join(by_half)}"] if by_half else [])
 
 
-def _parameter_lines(calibration: Calibration) -> list[str]:
+def _list_parameters(calibration: Calibration) -> list[str]:
     """List the parameters if any uncertainty is known."""
     rows, direction_deg = parameter_rows(calibration), calibration.std().sheet_normal_deg
     if direction_deg is None and all(row.std is None for row in rows):
@@ -348,7 +348,7 @@ def _parameter_lines(calibration: Calibration) -> list[str]:
     return lines if direction_deg is None else [*lines, f"  direction of the sheet's normal: ± {direction_deg:.2g} °"]
 
 
-def _figure_lines(calibration: Calibration | PolynomialCalibration, **shown: tuple[str, str]) -> list[str]:
+def _list_figures(calibration: Calibration | PolynomialCalibration, **shown: tuple[str, str]) -> list[str]:
     """Format figures of calibration steps, each given by name and text."""
     found = ((calibration.figures(step).get(name), text) for step, (name, text) in shown.items())
     return [text.format(value) for value, text in found if value is not None]
@@ -416,7 +416,7 @@ def polynomial_lines(calibration: PolynomialCalibration) -> list[str]:
         f"degree {calibration.degree}, for {reached} of the lines {calibration.first_line} to {last}, Z from {low:.1f} "
         f"to {high:.1f} mm",
     ]
-    return lines + _figure_lines(
+    return lines + _list_figures(
         calibration,
         depth=("rms_mm", "Z(position): residual {:.4f} mm (rms)"),
         along=("rms_mm", "Y(Z): residual {:.4f} mm (rms)"),

@@ -162,8 +162,8 @@ def write_findings(
     stated = load_order(order)
     points = load_cloud(path, unit=unit)
     by_hand = None if measured is None else read_measured(measured)
-    sources = _sources(path, points, captures, calibration, certificate)
-    checks = [_artefact_check(each, points) for each in verification]
+    sources = _list_sources(path, points, captures, calibration, certificate)
+    checks = [_find_artefact_check(each, points) for each in verification]
     sources += [
         Source("verification", Path(each).name, hash_file(each), "by the same calibration") for each in verification
     ]
@@ -174,7 +174,7 @@ def write_findings(
     if kind == "pipe" and (note := resolve_datum(stated.datum, found.features[0].axes[2])[2]):
         found = replace(found, notes=(*found.notes, note))
     made, title = datetime.now(UTC), title or stated.object or f"Inspection of {path.name}"
-    text = _page(found, points, sources, checks, stated, by_hand, title=title, made=made)
+    text = _render(found, points, sources, checks, stated, by_hand, title=title, made=made)
     record: Table = {
         "title": title,
         "made": made.isoformat(timespec="seconds"),
@@ -204,7 +204,7 @@ def write_findings(
     return found
 
 
-def _sources(
+def _list_sources(
     path: Path,
     cloud: PointCloud,
     captures: Sequence[str | Path],
@@ -236,7 +236,7 @@ def _sources(
     return sources
 
 
-def _artefact_check(path: str | Path, cloud: PointCloud) -> tuple[str, tuple[Figure, ...]]:
+def _find_artefact_check(path: str | Path, cloud: PointCloud) -> tuple[str, tuple[Figure, ...]]:
     """Return name and figures of an artefact that was measured with the calibration named by the cloud."""
     record, named = read_evaluation(path), cloud.metadata.get("calibration")
     if record.artefact is None or record.evaluation is None:
@@ -257,7 +257,7 @@ def _check_row(figure: Figure) -> tuple[str, ...]:
     return figure.key.name.replace("_", " "), calibrated, format_to_scale(figure.value_mm, fine, digits=2), stated
 
 
-def _page(
+def _render(
     found: Inspection,
     cloud: PointCloud,
     sources: list[Source],
@@ -290,13 +290,13 @@ def _page(
         metadata=cloud.metadata,
         sources=sources,
         conclusion=_conclude(listed, order, found),
-        findings=_finding_rows(listed, found, cloud, order) if listed else None,
-        all_values=_rows(parts),
-        whole=[(each.name, [_value_row(value) for value in each.values]) for each in whole],
-        repeated=_rows(repeated),
+        findings=_list_findings(listed, found, cloud, order) if listed else None,
+        all_values=_list_features(parts),
+        whole=[(each.name, [_make_value_row(value) for value in each.values]) for each in whole],
+        repeated=_list_features(repeated),
         by_hand=None if by_hand is None else (COLUMNS, [each.row() for each in by_hand.values]),
         maps=_make_maps(found, cloud, parts, order),
-        accuracy=_point_accuracy(cloud),
+        accuracy=_state_point_accuracy(cloud),
         depths=[format_to_scale(each, each, digits=2) for each in dict.fromkeys((*depths[:1], *depths[-1:]))],
         pictures=[
             (each.title, judge_feature(each, order.limits)[0], _plot_finding(each, found, cloud)) for each in drawn
@@ -331,7 +331,7 @@ def _conclude(listed: Sequence[Feature], order: FindingOrder, found: Inspection)
     return worst, f"{text} {omitted} % of the points are not inspected." if omitted else text
 
 
-def _finding_rows(
+def _list_findings(
     listed: Sequence[Feature], found: Inspection, cloud: PointCloud, order: FindingOrder
 ) -> tuple[tuple[str, ...], list[tuple[str, tuple[str, ...]]]]:
     """Return headings and rows of the first page: verdict, and texts on verdict, place and size of every finding."""
@@ -372,7 +372,7 @@ def format_interval(value: FeatureValue) -> str:
     return f"{shown} ± {format_to_scale(half, half, digits=2)}"
 
 
-def _value_row(value: FeatureValue) -> tuple[str, ...]:
+def _make_value_row(value: FeatureValue) -> tuple[str, ...]:
     parts = value.random, value.systematic
     fine = [
         MISSING if part is None else format_to_scale(part, part, digits=2) if part > _SMALLEST else "0"
@@ -381,7 +381,7 @@ def _value_row(value: FeatureValue) -> tuple[str, ...]:
     return value.name, value.unit, format_interval(value), *fine
 
 
-def _rows(features: Sequence[Feature]) -> tuple[tuple[str, ...], list[tuple[str, ...]]] | None:
+def _list_features(features: Sequence[Feature]) -> tuple[tuple[str, ...], list[tuple[str, ...]]] | None:
     """Return headings and rows of features; None without features."""
     if not features:
         return None
@@ -452,7 +452,7 @@ def _colour_scale(found: Inspection) -> dict[str, Any]:
     return {"cmap": DEVIATIONS, "vmin": -limit, "vmax": limit, "linewidths": 0}
 
 
-def _point_accuracy(cloud: PointCloud) -> list[str] | None:
+def _state_point_accuracy(cloud: PointCloud) -> list[str] | None:
     """Return the expanded uncertainty of points across the surface; None if the cloud does not know it.
 
     The texts are the median, those of its random and common parts, and the 95 % quantile, in mm.

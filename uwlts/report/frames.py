@@ -58,7 +58,7 @@ def to_frame(result: object) -> DataFrame:
     table: Any
     match result:
         case PointCloud():
-            table = _point_columns(result)
+            table = _list_point_columns(result)
         case Evaluation():
             table = [_make_row(each) for each in result.figures]
         case Inspection():
@@ -76,7 +76,7 @@ def to_frame(result: object) -> DataFrame:
             table = columns
         case Mapping():
             table = result
-        case Sequence() if all(_field_names(type(each)) for each in result):
+        case Sequence() if all(_list_fields(type(each)) for each in result):
             table = [_make_row(each) for each in result]
         case _:
             raise ArgumentError(
@@ -90,7 +90,7 @@ def to_frame(result: object) -> DataFrame:
         raise ArgumentError(f"`result` is no set of columns of equal length: {error}") from error
 
 
-def _point_columns(cloud: PointCloud) -> dict[str, np.ndarray]:
+def _list_point_columns(cloud: PointCloud) -> dict[str, np.ndarray]:
     """Return the known columns (N,) of a cloud."""
     columns = dict(zip(("x_mm", "y_mm", "z_mm"), cloud.points_mm.T, strict=True)) | {"intensity": cloud.intensity}
     for name in ("frame", "line"):
@@ -98,7 +98,7 @@ def _point_columns(cloud: PointCloud) -> dict[str, np.ndarray]:
             columns[name] = known
     columns |= {name: getattr(cloud, name) for name in ("time_s", "deviation_mm", "random_std_mm", "common_std_mm")}
     if cloud.uncertainty is not None:
-        columns |= dict(zip(_axis_names("std_mm"), cloud.uncertainty.std_mm().T, strict=True))
+        columns |= dict(zip(_name_axes("std_mm"), cloud.uncertainty.std_mm().T, strict=True))
     return {name: values for name, values in columns.items() if values is not None}
 
 
@@ -115,14 +115,14 @@ def _flatten(record: object | None, kind: type) -> dict[str, Any]:
     """Return the plain fields of a record, None for those of a missing one."""
     row: dict[str, Any] = {}
     hints = get_type_hints(kind)
-    for name in _field_names(kind):
+    for name in _list_fields(kind):
         value = getattr(record, name, None)
         inner = next((each for each in union_members(hints[name]) if dataclasses.is_dataclass(each)), None)
         if isinstance(inner, type):
             prefix = "" if name == _KEY else f"{name}_"
             row |= {f"{prefix}{within}": each for within, each in _flatten(value, inner).items()}
         elif name.endswith("_mm") and value is not None and np.shape(value) == (3,):
-            row |= dict(zip(_axis_names(name), np.asarray(value).tolist(), strict=True))
+            row |= dict(zip(_name_axes(name), np.asarray(value).tolist(), strict=True))
         elif isinstance(value, Enum):
             row[name] = str(value)
         elif _is_plain(value) or (isinstance(value, tuple) and all(map(_is_plain, value))):
@@ -130,7 +130,7 @@ def _flatten(record: object | None, kind: type) -> dict[str, Any]:
     return row
 
 
-def _field_names(kind: Any) -> Sequence[str]:
+def _list_fields(kind: Any) -> Sequence[str]:
     """Return the names of a record's fields; none for other types."""
     if dataclasses.is_dataclass(kind):
         return [field.name for field in dataclasses.fields(kind)]
@@ -142,7 +142,7 @@ def _mark_missing(value: object, hint: object) -> object:
     return np.nan if value is None and float in union_members(hint) else value
 
 
-def _axis_names(name: str) -> list[str]:
+def _name_axes(name: str) -> list[str]:
     """Return the names of a vector's columns, such as ``std_x_mm`` for ``std_mm``."""
     return [f"{name.removesuffix('_mm')}_{axis}_mm" for axis in "xyz"]
 

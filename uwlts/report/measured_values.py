@@ -70,16 +70,16 @@ class MeasuredValue(Description):
     def interval_text(self) -> str:
         """Return quantity, value and interval as text, or the reason why there is no interval."""
         known = self.expanded_mm is not None
-        stated = f"± {self._figure(self.expanded_mm)} mm" if known else f"mm ({self.without_interval})"
-        return f"{self.quantity} {self._figure(self.value_mm)} {stated}"
+        stated = f"± {self._format_figure(self.expanded_mm)} mm" if known else f"mm ({self.without_interval})"
+        return f"{self.quantity} {self._format_figure(self.value_mm)} {stated}"
 
     def row(self) -> tuple[str, ...]:
         """Return the texts of a table with `COLUMNS`."""
         limits = [MISSING if each is None else f"{each:g}" for each in (self.lower_mm, self.upper_mm)]
-        stated = self.without_interval if self.expanded_mm is None else self._figure(self.expanded_mm)
-        return self.name, self.quantity, self._figure(self.value_mm), stated, *limits, self.verdict, self.source
+        stated = self.without_interval if self.expanded_mm is None else self._format_figure(self.expanded_mm)
+        return self.name, self.quantity, self._format_figure(self.value_mm), stated, *limits, self.verdict, self.source
 
-    def _figure(self, value_mm: float | None) -> str:
+    def _format_figure(self, value_mm: float | None) -> str:
         return MISSING if value_mm is None else format_to_scale(value_mm, self.expanded_mm or _SHOWN_MM, digits=2)
 
 

@@ -170,7 +170,7 @@ def stripe(
     grey = image.image if isinstance(image, Frame) else image
     if grey.ndim != 2:
         raise ImageError(f"`image` has the shape {grey.shape}; expected rows and columns of grey values")
-    ax = _axes(ax, 11.2, 4.0)
+    ax = _choose_axes(ax, 11.2, 4.0)
     names = ("column u / px", "row v / px")
     if stripe is not None and stripe.stripe_along == "height":
         grey, names = grey.T, names[::-1]
@@ -236,7 +236,7 @@ def residuals(calibration: Calibration, ax: Axes | None = None, *, which: str | 
     """
     lists = {
         f"{group}.{name}": values
-        for group, name, value in _entries_of(calibration.residuals_in_file())
+        for group, name, value in _list_entries(calibration.residuals_in_file())
         if len(values := number_list(value) or ()) > _SHORT_LIST and any(each is not None for each in values)
     }
     if which is None and not lists:
@@ -248,7 +248,7 @@ def residuals(calibration: Calibration, ax: Axes | None = None, *, which: str | 
     stored = calibration.figures(group).get("images")
     images = [image for image in stored if isinstance(image, str)] if isinstance(stored, list) else []
     images = images if len(images) == len(values) else []
-    ax = _axes(ax)
+    ax = _choose_axes(ax)
     places = np.arange(1, len(values) + 1)
     heights = np.array([np.nan if value is None else value for value in values])
     if np.nanmin(heights) > 0 and np.nanmax(heights) < _FLAT * np.nanmin(heights):
@@ -270,14 +270,14 @@ def residuals(calibration: Calibration, ax: Axes | None = None, *, which: str | 
     return ax
 
 
-def _entries_of(table: Mapping[str, Any], group: str = "") -> Iterator[tuple[str, str, Any]]:
+def _list_entries(table: Mapping[str, Any], group: str = "") -> Iterator[tuple[str, str, Any]]:
     """Iterate over group, name and value of the entries of nested tables; a group is the names of its tables."""
     for name, value in table.items():
         if isinstance(value, dict):
-            yield from _entries_of(value, f"{group} {name}".strip())
+            yield from _list_entries(value, f"{group} {name}".strip())
         else:
             yield group, name, value
 
 
-def _axes(ax: Axes | None, *size: float) -> Axes:
+def _choose_axes(ax: Axes | None, *size: float) -> Axes:
     return new_figure(*size, shown=True)[1][0] if ax is None else ax

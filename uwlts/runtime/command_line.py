@@ -160,7 +160,7 @@ class DerivedCommand:
         parameters = dict(list(inspect.signature(self._body, eval_str=True).parameters.items())[1:])
         like = [name for name, one in parameters.items() if one.annotation is one.empty and name not in self._taken]
         # Of several functions with the option, the first one counts.
-        sources = [_options_of(*function) for function in reversed(self._also)] if like else []
+        sources = [_list_options(*function) for function in reversed(self._also)] if like else []
         options = {name: one for source in sources for name, one in source.items()}
         for name in like:
             parameters[name] = parameters[name].replace(
@@ -170,7 +170,7 @@ class DerivedCommand:
 
     @cached_property
     def __signature__(self) -> inspect.Signature:
-        taken, options = self._taken, _options_of(self._package, self._function)
+        taken, options = self._taken, _list_options(self._package, self._function)
         if self._shortcuts is not None:
             for entry, hint in self._shortcuts.options.items():
                 name = f"{self._shortcuts.setting}_{entry}"
@@ -224,7 +224,7 @@ class DerivedCommand:
         return value[0] if isinstance(value, tuple) and len(value) == 1 and value[0] in alone else value
 
 
-def _options_of(package: ModuleType, function: str) -> dict[str, inspect.Parameter]:
+def _list_options(package: ModuleType, function: str) -> dict[str, inspect.Parameter]:
     """Return the parameters of a function that can be given as text, typed for the command line."""
     taken, described = getattr(package, function), descriptions(package, function)
     hints, options = get_type_hints(taken), {}
@@ -263,16 +263,16 @@ def option_type(hint: Any) -> Any:
         if element is None or (names and element not in names):
             continue
         if get_origin(kind) is tuple and get_args(kind)[-1] is not ...:
-            return _or_none(kind, kinds)
+            return _make_optional(kind, kinds)
         if literals and get_origin(element) is Literal:
             element = Literal[(*(word for one in literals for word in get_args(one)), *get_args(element))]
         return tuple[element, ...]
     if plain := names or literals:
-        return _or_none(reduce(or_, plain), kinds)
+        return _make_optional(reduce(or_, plain), kinds)
     return tuple[str, ...] if any(get_origin(kind) is Mapping for kind in kinds) else None
 
 
-def _or_none(kind: Any, kinds: Iterable[Any]) -> Any:
+def _make_optional(kind: Any, kinds: Iterable[Any]) -> Any:
     return kind | None if NoneType in kinds else kind
 
 
@@ -320,7 +320,7 @@ def _sections(text: str) -> list[str]:
 
 
 @cache
-def _modules(package: ModuleType) -> dict[str, str]:
+def _read_modules(package: ModuleType) -> dict[str, str]:
     """Return the modules of the names in a package's stub."""
     stub = Path(f"{package.__file__}i").read_text(encoding="utf-8")
     return {
@@ -334,7 +334,7 @@ def _modules(package: ModuleType) -> dict[str, str]:
 @cache
 def docstring(package: ModuleType, function: str) -> str:
     """Return the docstring of a function in the package's stub, without importing the function."""
-    place = Path(str(package.__file__)).parent.joinpath(*_modules(package)[function].split("."))
+    place = Path(str(package.__file__)).parent.joinpath(*_read_modules(package)[function].split("."))
     source = (place / "__init__.py" if place.is_dir() else place.with_suffix(".py")).read_text(encoding="utf-8")
     found = re.search(rf'^def {function}\(.*?"""(.*?)"""', source, flags=re.MULTILINE | re.DOTALL)
     if found is None:

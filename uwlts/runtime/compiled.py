@@ -75,7 +75,7 @@ def _compile_cached(
         files = {
             inspect.getfile(each) for each in (function, *(c.py_func for c in called if isinstance(c, Dispatcher)))
         }
-        kept._cache._cache_file._source_stamp = tuple(map(_stamp, sorted({Path(file).parent for file in files})))
+        kept._cache._cache_file._source_stamp = tuple(map(_read_stamp, sorted({Path(file).parent for file in files})))
     except (RuntimeError, AttributeError):
         return njit(**options)(function)
     return kept
@@ -97,7 +97,7 @@ def compiled_inline(function: Callable[_Parameters, _Result]) -> Callable[_Param
 
 
 @cache
-def _stamp(folder: Path) -> tuple[tuple[str, int, int], ...]:
+def _read_stamp(folder: Path) -> tuple[tuple[str, int, int], ...]:
     """Return names, times and sizes of the source files of a folder's package: the one directly below ``uwlts``."""
     package = next((each for each in (folder, *folder.parents) if each.parent.name == "uwlts"), folder)
     found = ((path, path.stat()) for path in sorted(package.rglob("*.py")))

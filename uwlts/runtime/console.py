@@ -50,7 +50,7 @@ def progress_bar(title: str) -> Iterator[ProgressListener]:
         return
     if not console.is_terminal:
         # In rich before 14.3 a disabled bar prints an empty line.
-        yield _progress_lines(title)
+        yield _print_progress(title)
         return
     times = TimeElapsedColumn(), TimeRemainingColumn()
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *times
@@ -67,7 +67,7 @@ def progress_bar(title: str) -> Iterator[ProgressListener]:
         yield listen
 
 
-def _progress_lines(title: str) -> ProgressListener:
+def _print_progress(title: str) -> ProgressListener:
     """Return a listener that prints the progress as lines."""
     begun = shown_s = time.monotonic()
 

@@ -66,11 +66,11 @@ class Cylinder:
         """
         unit, known = prepare_round(points, radius_mm, least=6, what="a cylinder fit")
         thinned = thin_evenly(unit.points, _THINNED)
-        trials = [_refine_cylinder(thinned, *start, known) for start in _cylinder_starts(thinned, known, axis_start)]
+        trials = [_refine_cylinder(thinned, *start, known) for start in _list_starts(thinned, known, axis_start)]
         frame, start, _ = min(trials, key=lambda trial: trial[2])
         frame, parameters, cost = _refine_cylinder(unit.points, frame, start, known)
         covariance, std = parameter_covariance(
-            _cylinder_jacobian(parameters, unit.points, frame), cost, what="a cylinder"
+            _compute_jacobian(parameters, unit.points, frame), cost, what="a cylinder"
         )
         units = np.array([unit.scale_mm, unit.scale_mm, 1.0, 1.0, unit.scale_mm])[: len(parameters)]
         covariance = covariance * np.outer(units, units)
@@ -88,7 +88,7 @@ class Cylinder:
         return cls(point, frame[2], frame[:2], radius, residuals, std * unit.scale_mm, covariance)
 
 
-def _cylinder_geometry(
+def _compute_geometry(
     parameters: np.ndarray, points: np.ndarray, frame: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return radial vectors (N, 3), positions along the axis (N,), and the norm of the direction a + s u + t v."""
@@ -100,9 +100,9 @@ def _cylinder_geometry(
     return offset - along[:, None] * direction, along, stretch
 
 
-def _cylinder_jacobian(parameters: np.ndarray, points: np.ndarray, frame: np.ndarray) -> np.ndarray:
+def _compute_jacobian(parameters: np.ndarray, points: np.ndarray, frame: np.ndarray) -> np.ndarray:
     """Return the derivatives -e.u, -e.v, -along e.u / stretch, the same with v, and -1, for radial unit vectors e."""
-    radial, along, stretch = _cylinder_geometry(parameters, points, frame)
+    radial, along, stretch = _compute_geometry(parameters, points, frame)
     across = -unit_vectors(radial) @ frame[:2].T
     by_radius = np.full((len(points), len(parameters) - 4), -1.0)
     return np.hstack([across, across * (along / stretch)[:, None], by_radius])
@@ -113,16 +113,16 @@ def _refine_cylinder(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return frame, parameters and cost of the solution, with the frame rotated so that both slopes are zero."""
     parameters, cost = minimise_squares(
-        lambda x: np.linalg.norm(_cylinder_geometry(x, points, frame)[0], axis=1) - (x[4] if known is None else known),
-        lambda x: _cylinder_jacobian(x, points, frame),
+        lambda x: np.linalg.norm(_compute_geometry(x, points, frame)[0], axis=1) - (x[4] if known is None else known),
+        lambda x: _compute_jacobian(x, points, frame),
         start,
     )
-    turned = _axis_frame(frame[2] + parameters[2:4] @ frame[:2])
+    turned = _find_axis_frame(frame[2] + parameters[2:4] @ frame[:2])
     foot = turned[:2] @ (parameters[:2] @ frame[:2])
     return turned, np.array([*foot, 0.0, 0.0, *parameters[4:]]), cost
 
 
-def _axis_frame(axis: np.ndarray) -> np.ndarray:
+def _find_axis_frame(axis: np.ndarray) -> np.ndarray:
     """Return right-handed unit directions (u, v, axis) in rows; the largest component of the axis becomes positive.
 
     The first is normal to the coordinate axis after that of the largest component. Noise of an axis along a coordinate
@@ -137,7 +137,7 @@ def _axis_frame(axis: np.ndarray) -> np.ndarray:
     return np.array([first, np.cross(axis, first), axis])
 
 
-def _cylinder_starts(points: np.ndarray, known: float | None, axis_start: Any) -> list[tuple[np.ndarray, np.ndarray]]:
+def _list_starts(points: np.ndarray, known: float | None, axis_start: Any) -> list[tuple[np.ndarray, np.ndarray]]:
     if axis_start is None:
         # Evenly spread directions with z > 0: a Fibonacci lattice.
         step = np.arange(_DIRECTIONS) + 0.5
@@ -151,7 +151,7 @@ def _cylinder_starts(points: np.ndarray, known: float | None, axis_start: Any) -
         directions = np.asarray(axis_start, dtype=np.float64).reshape(1, 3)
         if not np.isfinite(directions).all() or not directions.any():
             raise ValueError(f"axis_start is {axis_start}; expected a direction")
-    frames = np.array([_axis_frame(direction) for direction in directions])
+    frames = np.array([_find_axis_frame(direction) for direction in directions])
     seen = np.einsum("nd,kcd->knc", points, frames[:, :2])
     middle = seen.mean(axis=1)
     centred = seen - middle[:, None]

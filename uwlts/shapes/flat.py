@@ -39,7 +39,7 @@ class Flat:
 
     def distances_mm(self, points: np.ndarray) -> np.ndarray:
         """Return the distances (M,) of points (M, D), as in `residuals_mm`."""
-        return _norms((np.asarray(points, dtype=np.float64) - self.point_mm) @ self.normals.T)
+        return _compute_norms((np.asarray(points, dtype=np.float64) - self.point_mm) @ self.normals.T)
 
     def normals_at(self, points: np.ndarray) -> np.ndarray:
         """Return the unit normals (M, D) of the distances of points (M, D) from a plane, or from a line in a plane."""
@@ -50,12 +50,12 @@ class Flat:
         return -np.column_stack([np.ones(len(points)), (points - self.point_mm) @ self.axes.T])
 
     @classmethod
-    def _from_axes(cls, unit: Normalised, axes: np.ndarray, normals: np.ndarray) -> Self:
+    def _make_from_axes(cls, unit: Normalised, axes: np.ndarray, normals: np.ndarray) -> Self:
         across = (unit.given_mm - unit.centroid_mm) @ normals.T
         variance = float(np.sum(across**2)) / (len(normals) * (len(across) - len(axes) - 1))
         leverage = np.array([len(across), *(unit.extents[: len(axes)] * unit.scale_mm) ** 2])
         covariance = np.diag(variance / np.repeat(leverage, len(normals)))
-        return cls(unit.centroid_mm, axes, normals, _norms(across), variance**0.5, covariance)
+        return cls(unit.centroid_mm, axes, normals, _compute_norms(across), variance**0.5, covariance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ class Plane(Flat):
         unit = normalise_points(points, least=4, what="a plane fit")
         if unit.is_flat(1):
             raise EvaluationError(f"a plane fit: all {len(unit.points)} points lie on one line")
-        return cls._from_axes(unit, unit.axes[:2], _orient(unit.axes[2], towards)[None])
+        return cls._make_from_axes(unit, unit.axes[:2], _orient(unit.axes[2], towards)[None])
 
     @classmethod
     def find(cls, points: np.ndarray, *, towards: Any, off: float) -> tuple[Self, np.ndarray]:
@@ -117,7 +117,7 @@ class Line(Flat):
         if unit.extents[0] - unit.extents[1] <= 1e-9 * unit.extents[0]:
             raise EvaluationError(f"a line fit: the {len(unit.points)} points extend equally in two directions")
         x, y, *z = direction = _orient(unit.axes[0], towards)
-        return cls._from_axes(unit, direction[None], unit.axes[1:] if z else np.array([[-y, x]]))
+        return cls._make_from_axes(unit, direction[None], unit.axes[1:] if z else np.array([[-y, x]]))
 
 
 def _orient(direction: np.ndarray, towards: Any) -> np.ndarray:
@@ -125,7 +125,7 @@ def _orient(direction: np.ndarray, towards: Any) -> np.ndarray:
     return -direction if side < 0 else direction
 
 
-def _norms(across: np.ndarray) -> np.ndarray:
+def _compute_norms(across: np.ndarray) -> np.ndarray:
     """Return distances from normal components (..., C), signed if there is one component."""
     return across[..., 0] if across.shape[-1] == 1 else np.linalg.norm(across, axis=-1)
 

@@ -92,7 +92,7 @@ def find_arc(points: np.ndarray, radius_mm: float | None, rng: np.random.Generat
     span = np.exp(rng.uniform(np.log(LEAST_POINTS // 2), np.log(widest), size=_TRIALS)).astype(int)
     first = (rng.random(_TRIALS) * np.maximum(count - 2 * span, 1)).astype(int)
     picked = points[np.minimum(first[:, None] + span[:, None] * np.arange(3), count - 1)]
-    centres, radii = _circles_through(picked)
+    centres, radii = _compute_circles_through(picked)
     fits = np.isfinite(radii) & (radii < largest)
     if not fits.any():
         return None
@@ -135,7 +135,7 @@ def _fits_radius(arc: ProfileArc, points: np.ndarray, radius_mm: float, toleranc
     return largest - height < 2 * tolerance
 
 
-def _circles_through(triples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _compute_circles_through(triples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return centres (M, 2) and radii (M,) of circles through triples (M, 3, 2); infinite for collinear points."""
     b, c = triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -173,7 +173,7 @@ def _refine_arc(points: np.ndarray, members: np.ndarray, tolerance: float) -> Pr
         circle = Circle.fit(points[members])
     except EvaluationError:
         return None  # the points are on a line
-    if _arc_angle(points[members] - circle.centre_mm) < _LEAST_ARC:
+    if _measure_arc_angle(points[members] - circle.centre_mm) < _LEAST_ARC:
         return None
     # Scattered points fill the band of 2 tolerances evenly: their robust standard deviation is 1.5 tolerances, that of
     # an arc at most 0.9. They are as dense beside the circle, in a band twice as wide.
@@ -184,7 +184,7 @@ def _refine_arc(points: np.ndarray, members: np.ndarray, tolerance: float) -> Pr
     return ProfileArc(members=members, std_mm=std, centre_mm=circle.centre_mm, radius_mm=circle.radius_mm)
 
 
-def _arc_angle(offsets: np.ndarray) -> float:
+def _measure_arc_angle(offsets: np.ndarray) -> float:
     angles = np.sort(np.arctan2(offsets[:, 1], offsets[:, 0]))
     return float(2 * np.pi - np.diff(angles, append=angles[0] + 2 * np.pi).max())
 

@@ -64,7 +64,7 @@ class Sphere:
 
         The derivative of |p - c| - r is minus the unit vector from the centre, and -1 for a free radius.
         """
-        return _derivatives(points, self.centre_mm, free=len(self.covariance) - 3)
+        return _compute_derivatives(points, self.centre_mm, free=len(self.covariance) - 3)
 
     @classmethod
     def fit(cls, points: Any, radius_mm: float | None = None) -> Self:
@@ -76,10 +76,10 @@ class Sphere:
         unit, known = prepare_round(points, radius_mm, least=5, what="a sphere fit")
         parameters, cost = minimise_squares(
             lambda x: np.linalg.norm(unit.points - x[:3], axis=1) - (x[3] if known is None else known),
-            lambda x: _derivatives(unit.points, x[:3], free=len(x) - 3),
+            lambda x: _compute_derivatives(unit.points, x[:3], free=len(x) - 3),
             np.hstack(fit_algebraic_centres(unit.points)) if known is None else initial_centre(unit.points, known),
         )
-        jacobian = _derivatives(unit.points, parameters[:3], free=len(parameters) - 3)
+        jacobian = _compute_derivatives(unit.points, parameters[:3], free=len(parameters) - 3)
         covariance, std = parameter_covariance(jacobian, cost, what="a sphere")
         centre = unit.centroid_mm + unit.scale_mm * parameters[:3]
         radius = float(radius_mm if radius_mm is not None else parameters[3] * unit.scale_mm)
@@ -123,7 +123,7 @@ class Sphere:
         return None
 
 
-def _derivatives(points: np.ndarray, centre: np.ndarray, *, free: int) -> np.ndarray:
+def _compute_derivatives(points: np.ndarray, centre: np.ndarray, *, free: int) -> np.ndarray:
     return np.hstack([-unit_vectors(points - centre), np.full((len(points), free), -1.0)])
 
 

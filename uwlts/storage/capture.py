@@ -222,17 +222,17 @@ class Capture(AbstractContextManager["Capture"]):
 
     def _read_frames(self, *, unfinished: bool) -> None:
         camera = self.header.sensor.camera
-        images = self._dataset("frames", (camera.height_px, camera.width_px), "u")
+        images = self._open_dataset("frames", (camera.height_px, camera.width_px), "u")
         if images.chunks != (1, *images.shape[1:]) or images.dtype.itemsize > 2:
             raise CaptureError(f"{self.path} is damaged: frames are {images.dtype} in chunks of {images.chunks}")
         held = PER_FRAME | {name: each for name, each in MORE.items() if name in self.file}
-        columns = {name: self._column(name, shape, np.dtype(kind).kind) for name, (shape, kind) in held.items()}
+        columns = {name: self._open_column(name, shape, np.dtype(kind).kind) for name, (shape, kind) in held.items()}
         self._images, self.dtype = images, images.dtype.newbyteorder("=")
         self.holds_lines = "centre_lines" in self.file
         self.moving = "stage_reports" in self.file
         self._count = min(map(len, (images, *columns.values())))
         if self.holds_lines:
-            self._lines = self._dataset("centre_lines", (len(ROWS), camera.lines()), "f")
+            self._lines = self._open_dataset("centre_lines", (len(ROWS), camera.lines()), "f")
             if self._lines.chunks != (1, *self._lines.shape[1:]):
                 raise CaptureError(f"{self.path} is damaged: centre lines are in chunks of {self._lines.chunks}")
             self._count = min(self._count, len(self._lines))
@@ -240,7 +240,7 @@ class Capture(AbstractContextManager["Capture"]):
             read_values(columns[name], slice(self._count)) if name in columns else np.full(self._count, usual)
             for name, usual in zip(MORE, (True, np.nan, 0.0), strict=True)
         )
-        reports = self._column("stage_reports", (2,), "f") if self.moving else None
+        reports = self._open_column("stage_reports", (2,), "f") if self.moving else None
         self.stage_reports = np.empty((0, 2)) if reports is None else read_values(reports)
         if self.holds_lines:
             self._require_stored(self._lines, int(np.count_nonzero(~self.has_image)), "centre lines")
@@ -274,7 +274,7 @@ class Capture(AbstractContextManager["Capture"]):
             raise CaptureError(f"{self.path} holds poses that are no rotation with a shift")
         if COVARIANCE not in self.file:
             return None
-        covariances = read_values(self._column(COVARIANCE, (6, 6), "f"), slice(self._count))
+        covariances = read_values(self._open_column(COVARIANCE, (6, 6), "f"), slice(self._count))
         known = np.isfinite(covariances).all(axis=(1, 2))
         if known.any():
             require_covariances(covariances[known], self.path)
@@ -285,7 +285,7 @@ class Capture(AbstractContextManager["Capture"]):
         if parts.id.get_num_chunks() < count:
             raise CaptureError(f"{self.path} is damaged: it holds {parts.id.get_num_chunks()} of {count} {called}")
 
-    def _dataset(self, name: str, shape: tuple[int, ...], kind: str) -> h5py.Dataset:
+    def _open_dataset(self, name: str, shape: tuple[int, ...], kind: str) -> h5py.Dataset:
         """Return a dataset with one row of this shape per frame; raises CaptureError for any other dataset."""
         dataset = find_dataset(self.file, name, path=self.path)
         if dataset is None or dataset.ndim == 0:
@@ -297,9 +297,9 @@ class Capture(AbstractContextManager["Capture"]):
             )
         return dataset
 
-    def _column(self, name: str, shape: tuple[int, ...], kind: str) -> h5py.Dataset:
+    def _open_column(self, name: str, shape: tuple[int, ...], kind: str) -> h5py.Dataset:
         """Return such a dataset that is read as a whole."""
-        dataset = self._dataset(name, shape, kind)
+        dataset = self._open_dataset(name, shape, kind)
         require_small_chunks(dataset, name, path=self.path)
         return dataset
 

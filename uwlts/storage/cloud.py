@@ -102,11 +102,11 @@ class PointUncertainty:
 
     def independent_mm2(self) -> np.ndarray:
         """Return the covariance (N, 6) of each point due to noise and to errors of its image's position and pose."""
-        return self.random_mm2 + _pairs_of(self.image_errors_mm())
+        return self.random_mm2 + _sum_pairs(self.image_errors_mm())
 
     def systematic_mm2(self) -> np.ndarray:
         """Return the covariance (N, 6) of each point due to calibration and stage."""
-        return _pairs_of(self.patterns_mm)
+        return _sum_pairs(self.patterns_mm)
 
     def covariance_mm2(self) -> np.ndarray:
         """Return the total covariance (N, 3, 3) of each point's coordinates."""
@@ -117,7 +117,7 @@ class PointUncertainty:
         return np.sqrt(np.einsum("nii->ni", self.covariance_mm2()))
 
 
-def _pairs_of(parts_mm: np.ndarray) -> np.ndarray:
+def _sum_pairs(parts_mm: np.ndarray) -> np.ndarray:
     """Return the covariances (N, 6) of points displaced by independent parts (M, N, 3); see `PAIRS`."""
     blocks = (parts_mm[:, start : start + _BLOCK] for start in range(0, max(1, parts_mm.shape[1]), _BLOCK))
     axes = (np.ascontiguousarray(block.transpose(2, 0, 1)) for block in blocks)
@@ -331,7 +331,7 @@ def compute_normal_std(cloud: PointCloud) -> tuple[np.ndarray | None, np.ndarray
     known = cloud.uncertainty
     if known is None:
         return cloud.random_std_mm, cloud.common_std_mm
-    normals = np.cross(_directions(cloud, known, "frame"), _directions(cloud, known, "line"))
+    normals = np.cross(_find_directions(cloud, known, "frame"), _find_directions(cloud, known, "line"))
     length = np.linalg.norm(normals, axis=1)
     lost = length == 0
     normals = normals / np.where(lost, 1.0, length)[:, None]
@@ -343,7 +343,7 @@ def compute_normal_std(cloud: PointCloud) -> tuple[np.ndarray | None, np.ndarray
     return random, common
 
 
-def _directions(cloud: PointCloud, known: PointUncertainty, along: str) -> np.ndarray:
+def _find_directions(cloud: PointCloud, known: PointUncertainty, along: str) -> np.ndarray:
     """Return vectors (N, 3) to a neighbour whose ``along`` ("frame" or "line") alone differs; 0 without neighbours."""
     frame, line = cloud.frame.astype(np.int64), cloud.line.astype(np.int64)
     if not len(cloud) or (frame == NO_INDEX).any() or (line == NO_INDEX).any():

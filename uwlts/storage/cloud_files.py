@@ -95,7 +95,7 @@ def write_cloud(
         with write_atomically(path, overwrite=overwrite) as aside:
             form.write(aside, cloud, colours, path)
         return
-    if _in_hdf5(path):
+    if _is_hdf5(path):
         with write_cloud_in_parts(path, overwrite=overwrite) as write:
             write(cloud)
         return
@@ -115,9 +115,9 @@ def write_cloud(
         columns[name] = None if (indices == NO_INDEX).all() else indices
     columns = {name: values for name, values in columns.items() if values is not None}
     if full:
-        columns |= _uncertainty_columns(cloud.uncertainty)
+        columns |= _list_uncertainty_columns(cloud.uncertainty)
     cloud = cloud if full else replace(cloud, uncertainty=None)
-    write_ply_points(path, columns, comments=_comments(_add_shared(cloud)), overwrite=overwrite)
+    write_ply_points(path, columns, comments=_make_comments(_add_shared(cloud)), overwrite=overwrite)
 
 
 @contextmanager
@@ -128,7 +128,7 @@ def write_cloud_in_parts(
 
     HDF5 is written part by part. For other formats all parts are held in memory.
     """
-    if not _in_hdf5(path):
+    if not _is_hdf5(path):
         parts: list[PointCloud] = []
         yield parts.append
         write_cloud(path, concatenate_clouds(parts) if len(parts) > 1 else parts[0], overwrite=overwrite)
@@ -271,7 +271,7 @@ def _convert_to_mm(cloud: PointCloud, path: str | os.PathLike[str], unit: Unit |
     form = find_format(path)
     # Foreign formats without a prescribed unit were converted when they were read.
     if form is None or form.unit is not None:
-        of_program = _in_hdf5(path) or bool(cloud.metadata.keys() - {STEP}) or cloud.uncertainty is not None
+        of_program = _is_hdf5(path) or bool(cloud.metadata.keys() - {STEP}) or cloud.uncertainty is not None
         stated = unit_of(path) if of_program or form is not None else None
         if unit is not None and stated not in (None, unit):
             raise CaptureError(
@@ -301,7 +301,7 @@ def _read_rows(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
         with open_regular(path, called="cloud") as file:
             if not file.read(4).startswith(b"ply"):
                 raise CaptureError(f"{path} ends with none of {', '.join(CLOUD_ENDINGS)}, the formats of clouds")
-    return _read_hdf5(path, rows) if _in_hdf5(path) else _read_ply(path, rows)
+    return _read_hdf5(path, rows) if _is_hdf5(path) else _read_ply(path, rows)
 
 
 def _choose_rows(count: int, at_most: int | None) -> slice:
@@ -322,7 +322,7 @@ def is_lean(path: str | os.PathLike[str]) -> bool:
 
 def is_cloud(path: str | os.PathLike[str]) -> bool:
     """Return whether a file is a cloud, by its ending, or by its label if captures have the same ending."""
-    if _in_hdf5(path):
+    if _is_hdf5(path):
         return read_format(Path(path)) == FORMAT
     if Path(path).suffix.lower() == ".ply":
         return True
@@ -335,11 +335,11 @@ def is_readable_cloud(path: str | os.PathLike[str]) -> bool:
     return is_cloud(path) or find_format(path) is not None
 
 
-def _in_hdf5(path: str | os.PathLike[str]) -> bool:
+def _is_hdf5(path: str | os.PathLike[str]) -> bool:
     return Path(path).suffix.lower() == ".h5"
 
 
-def _uncertainty_columns(uncertainty: PointUncertainty | None) -> dict[str, np.ndarray]:
+def _list_uncertainty_columns(uncertainty: PointUncertainty | None) -> dict[str, np.ndarray]:
     """Return columns (N,) float32 by the names of their vertex properties."""
     if uncertainty is None:
         return {}
@@ -379,14 +379,14 @@ def _split_shared(metadata: Table, known: PointUncertainty | None) -> tuple[Tabl
     return rest, replace(known, shared=shared)
 
 
-def _comments(metadata: Table) -> list[str]:
+def _make_comments(metadata: Table) -> list[str]:
     text = metadata_json(metadata)
     pieces = [text[start : start + _PIECE_LENGTH] for start in range(0, len(text), _PIECE_LENGTH)]
     # The semicolon protects a trailing blank of a piece, which readers strip.
     return [f"{_COMMENT} {number}/{len(pieces)} {piece};" for number, piece in enumerate(pieces, start=1)]
 
 
-def _metadata(comments: list[str]) -> Table:
+def _read_metadata(comments: list[str]) -> Table:
     stored = [comment for comment in comments if comment.startswith(_COMMENT)]
     if not stored:
         return {}
@@ -458,7 +458,7 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
         return column(name, np.nan) if name in known and uncertainty is None else None
 
     deviation = column("deviation", np.nan)
-    metadata, uncertainty = _split_shared(_metadata(comments), uncertainty)
+    metadata, uncertainty = _split_shared(_read_metadata(comments), uncertainty)
     cloud = PointCloud(
         points_mm=points,
         intensity=column("intensity", np.nan),

@@ -107,17 +107,17 @@ def read_label(
 
     Raises CaptureError if the file is foreign, newer or damaged.
     """
-    found = _text(file, "format")
+    found = _read_text(file, "format")
     if found != file_format:
         called = "it has no format" if found is None else f"its format is {found!r}"
         raise CaptureError(f"{path} is HDF5, but not what is expected here: {called}, expected '{file_format}'")
-    number = _attribute(file, "version", "iu")
+    number = _read_attribute(file, "version", "iu")
     if number is None or number < 1:
         found = "no number" if number is None else number
         raise CaptureError(f"{path} is damaged: its version is {found}, expected a whole number from 1")
     if number > version:
         raise CaptureError(f"{path} has version {number}; this program reads up to {version}: update it")
-    if (header := _text(file, "header")) is None:
+    if (header := _read_text(file, "header")) is None:
         raise CaptureError(f"{path} is damaged: its header is missing")
     content = _parse(header, f"{path} is damaged: its header")
     try:
@@ -140,7 +140,7 @@ def write_plan(file: h5py.File, plan: Table) -> None:
 
 def read_plan(file: h5py.File) -> Table | None:
     """Return the plan of an unfinished file, or None; raises CaptureError if it is damaged."""
-    if (text := _text(file, "plan")) is None:
+    if (text := _read_text(file, "plan")) is None:
         return None
     plan = _parse(text, f"{file.filename} is damaged: its plan")
     if not isinstance(plan, dict):
@@ -163,18 +163,18 @@ def read_format(path: str | Path) -> str | None:
     try:
         # Without a lock, because it may be a recording in progress.
         with h5py.File(path, "r", locking=False) as file:
-            return _text(file, "format")
+            return _read_text(file, "format")
     except DAMAGE:
         return None
 
 
-def _text(file: h5py.File, name: str) -> str | None:
+def _read_text(file: h5py.File, name: str) -> str | None:
     """Return an attribute's text, or None if it is missing or of another kind."""
-    value = _attribute(file, name, "S")
+    value = _read_attribute(file, name, "S")
     return value.decode() if isinstance(value, bytes) else None
 
 
-def _attribute(file: h5py.File, name: str, kinds: str) -> Any:
+def _read_attribute(file: h5py.File, name: str, kinds: str) -> Any:
     """Return an attribute that is a single value of some kinds; None if it is missing, another or too large."""
     if name not in file.attrs:
         return None

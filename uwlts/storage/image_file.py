@@ -61,7 +61,7 @@ def read_header(content: bytes, path: str | Path) -> ImageHeader:
         raise ImageError(f"{path} is no PNG, TIFF, BMP or JPEG image: {found}; leave it out or convert it")
     try:
         if kind == "TIFF":
-            found = _tiff_header(content)
+            found = _read_tiff_header(content)
         else:
             with Image.open(io.BytesIO(content), formats=[kind, "MPO"]) as image:
                 found = ImageHeader(kind, *image.size)
@@ -82,7 +82,7 @@ def read_header(content: bytes, path: str | Path) -> ImageHeader:
     return found
 
 
-def _tiff_header(content: bytes) -> ImageHeader:
+def _read_tiff_header(content: bytes) -> ImageHeader:
     """Read the first directory, also of images in modes that Pillow does not have."""
     big = content[2:4] in (b"+\0", b"\0+")
     directory = ImageFileDirectory_v2(content[: 16 if big else 8])

@@ -109,7 +109,7 @@ class SurfaceMesh(Brief):
             not set, or it cannot be written.
         """
         path = Path(path)
-        if (encode := {".ply": _ply, ".stl": _stl, ".glb": _glb}.get(path.suffix.lower())) is None:
+        if (encode := {".ply": _encode_ply, ".stl": _encode_stl, ".glb": _encode_glb}.get(path.suffix.lower())) is None:
             raise OutputError(f"{path} ends with none of {', '.join(MESH_FORMATS)}, which name the format of a mesh")
         content = encode(self)
         write_file(path, content, overwrite=overwrite)
@@ -134,7 +134,7 @@ def load_triangles(path: Path, *, unit: Unit | None = None) -> trimesh.Trimesh:
     require_regular_file(path, called="mesh")
     ending = path.suffix.lower()
     if ending == ".ply":
-        loaded: Any = trimesh.Trimesh(*_ply_triangles(path), process=False)
+        loaded: Any = trimesh.Trimesh(*_read_ply_triangles(path), process=False)
     else:
         try:
             loaded = trimesh.load(str(path), force="mesh", process=False, skip_materials=True)
@@ -173,7 +173,7 @@ def _find_unit(path: Path, known: str | None) -> tuple[str, list[str]]:
     return find_stated_unit([*comments, *([f"unit: {known}"] if known else [])])
 
 
-def _ply_triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def _read_ply_triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Read the vertices (V, 3) and triangles (F, 3) of a PLY file; polygons become fans."""
     vertices, faces = (read_ply(path, element, called="mesh")[0] for element in ("vertex", "face"))
     if vertices is None or faces is None or not {"x", "y", "z"} <= {*(vertices.dtype.names or ())}:
@@ -215,7 +215,7 @@ def read_mesh(path: str | Path, *, unit: Unit | None = None) -> SurfaceMesh:
     return SurfaceMesh(vertices, normals, faces, noise, shared)
 
 
-def _ply(mesh: SurfaceMesh) -> bytes:
+def _encode_ply(mesh: SurfaceMesh) -> bytes:
     columns = dict(zip("xyz", mesh.vertices_mm.T, strict=True))
     columns |= dict(zip(("nx", "ny", "nz"), mesh.normals.T.astype(np.float32), strict=True))
     parts = {"uncertainty": mesh.std_mm, "uncertainty_noise": mesh.noise_mm, "uncertainty_shared": mesh.shared_mm}
@@ -223,7 +223,7 @@ def _ply(mesh: SurfaceMesh) -> bytes:
     return encode_ply(columns, faces=mesh.faces)
 
 
-def _stl(mesh: SurfaceMesh) -> bytes:
+def _encode_stl(mesh: SurfaceMesh) -> bytes:
     import trimesh
 
     farthest = float(np.abs(mesh.vertices_mm).max())
@@ -236,7 +236,7 @@ def _stl(mesh: SurfaceMesh) -> bytes:
     return content
 
 
-def _glb(mesh: SurfaceMesh) -> bytes:
+def _encode_glb(mesh: SurfaceMesh) -> bytes:
     import trimesh
 
     # Coordinates about the middle keep their precision in 32 bits.

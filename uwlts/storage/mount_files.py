@@ -211,7 +211,7 @@ def read_profiles(
         for file in files:
             table = read_number_table(file)
             names.append(file.stem)
-            profiles.append(_points_of(table, unit))
+            profiles.append(_read_points(table, unit))
             times.append(float(next(iter(table.columns.get("time_s", ())), np.nan)))
     elif path.suffix.lower() in (".ply", ".h5") and is_cloud(path):
         cloud = read_cloud(path)
@@ -222,7 +222,7 @@ def read_profiles(
         columns = table.columns
         if "pose" not in columns:
             raise DescriptionError(f"{path} has no column 'pose', the pose to which each point belongs")
-        poses, points = columns["pose"], _points_of(table, unit)
+        poses, points = columns["pose"], _read_points(table, unit)
         if not np.isfinite(poses).all():
             raise DescriptionError(f"{path}: some cells of the column 'pose' are empty or not a number")
         labels = list(dict.fromkeys(poses.tolist()))
@@ -234,7 +234,7 @@ def read_profiles(
     return names, profiles, known if np.isfinite(known).all() else None
 
 
-def _points_of(table: NumberTable, unit: Unit | None) -> np.ndarray:
+def _read_points(table: NumberTable, unit: Unit | None) -> np.ndarray:
     """Return the points (N, 2) or (N, 3) of a table in mm."""
     columns = table.columns
     if not {"x", "z"} <= columns.keys():

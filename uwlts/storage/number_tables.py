@@ -121,7 +121,7 @@ def find_stated_unit(texts: Iterable[str]) -> tuple[str, list[str]]:
     """Return the unit of length that comments state, as "unit: m", else an empty text and doubts about other words."""
     texts = [*texts]
     matches = (_STATED_UNIT.fullmatch(text.lower()) for text in texts)
-    lengths = {_plain_unit(match[1]) for match in matches if match} & _LENGTHS.keys()
+    lengths = {_simplify_unit(match[1]) for match in matches if match} & _LENGTHS.keys()
     if len(lengths) == 1:
         return lengths.pop(), []
     stated = [text for text in texts if _UNIT_IN_COMMENT.search(text.lower())]
@@ -173,7 +173,7 @@ def read_number_table(path: Path, *, named: bool = True) -> NumberTable:
     content = read_bytes(path, most_bytes=_MOST_BYTES, error=DescriptionError, called="table")
     content = _decode_wide(content, path)
     comments, block, header, unit_row, lines = _split_lines(content, path)
-    delimiter, comma = _separators(lines[0])
+    delimiter, comma = _find_separators(lines[0])
     count = len(_split(lines[0], delimiter))
     named_in = header or next((each for each in reversed(comments) if _names_columns(each, delimiter, count)), None)
     cells = _name_cells(named_in, delimiter, count) if named_in else []
@@ -284,7 +284,7 @@ def _is_unit_row(line: bytes) -> bool:
 
 def _strip_unit(cell: str) -> str:
     """Return a unit without quotes and brackets; empty for a dash or one, which mean none."""
-    unit = _plain_unit(cell.strip(" \"'[]()<>").lower())
+    unit = _simplify_unit(cell.strip(" \"'[]()<>").lower())
     return "" if unit in ("-", "1") else unit
 
 
@@ -334,14 +334,14 @@ def _drop_block(lines: list[bytes]) -> tuple[list[bytes], list[bytes]]:
     for number, line in enumerate(lines[:_LONGEST_BLOCK]):
         further = lines[number + 1 : number + 3]
         if row := next((each for each in further if not _is_unit_row(each)), None):
-            cells, delimiter = _split(row), _separators(row)[0]
+            cells, delimiter = _split(row), _find_separators(row)[0]
             numbers = all(not cell.strip() or _is_number(cell) for cell in cells)
             if numbers and _names_columns(line, delimiter, len(cells)):
                 return lines[number:], lines[:number]
     return lines, []
 
 
-def _separators(line: bytes) -> tuple[bytes, bool]:
+def _find_separators(line: bytes) -> tuple[bytes, bool]:
     """Return the separator of a line, and whether commas are decimal although blanks separate the numbers."""
     for mark in (b";", b"\t"):
         if mark in line.strip():
@@ -354,7 +354,7 @@ def _separators(line: bytes) -> tuple[bytes, bool]:
 
 def _split(line: bytes, delimiter: bytes = b"") -> list[bytes]:
     """Return the cells of a line, by default by its own separator."""
-    delimiter = delimiter or _separators(line)[0]
+    delimiter = delimiter or _find_separators(line)[0]
     return line.split() if delimiter == b" " else line.split(delimiter)
 
 
@@ -402,15 +402,15 @@ def _split_unit(cell: str) -> tuple[str, str | None]:
     text = cell.lower().removeprefix("scalar_")
     unit = None
     if match := _IN_BRACKETS.fullmatch(text):
-        text, unit = match[1], _plain_unit(match[2]) or None
+        text, unit = match[1], _simplify_unit(match[2]) or None
     elif match := _AT_END.fullmatch(text):
-        stem, last = match[1] or match[3], _plain_unit(match[2] or match[4])
+        stem, last = match[1] or match[3], _simplify_unit(match[2] or match[4])
         if last in _UNITS and _normalise_name(stem) in _UNITS_OF.keys() | _LETTERS:
             text, unit = stem, last
     return _normalise_name(text.strip()), unit
 
 
-def _plain_unit(unit: str) -> str:
+def _simplify_unit(unit: str) -> str:
     unit = unit.strip().replace("µ", "u").replace("μ", "u")
     return _SAME_UNITS.get(unit.removesuffix("s") if len(unit) > len("sec") else unit, unit)
 

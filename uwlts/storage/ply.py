@@ -155,7 +155,7 @@ def _require_complete(
         raise _fault(path, f"early end-of-file, {declared}")
 
 
-def _table_type(properties: Sequence[_Property], order: str) -> np.dtype:
+def _make_table_type(properties: Sequence[_Property], order: str) -> np.dtype:
     return np.dtype([(one.name, "O" if one.length else order + one.kind) for one in properties])
 
 
@@ -163,7 +163,7 @@ def _parse_lines(lines: Sequence[bytes], properties: Sequence[_Property], count:
     """Parse the lines of an element, one for each row."""
     if len(lines) < count and properties:
         raise _fault(path, f"early end-of-file, {len(lines):,} of {count:,} lines of an element are there")
-    table = np.empty(count if properties else 0, _table_type(properties, "="))
+    table = np.empty(count if properties else 0, _make_table_type(properties, "="))
     columns: list[list[Any]] = [[] for _ in properties]
     for number, line in enumerate(lines if properties else ()):
         parts, place = line.split(), 0
@@ -195,13 +195,13 @@ def _parse_bytes(
     content: np.ndarray, properties: Sequence[_Property], count: int, order: str, path: Path
 ) -> tuple[np.ndarray, int]:
     """Parse the bytes of an element; return its table and the number of bytes."""
-    kind = _table_type(properties, order)
+    kind = _make_table_type(properties, order)
     if not kind.hasobject:
         used = count * kind.itemsize
         if used > len(content):
             raise _fault(path, f"early end-of-file, an element has {used:,} bytes, and the file {len(content):,} more")
         return (content[:used].view(kind) if used else np.empty(0, kind)), used
-    row = _row_type(content, properties, order)
+    row = _find_row_type(content, properties, order)
     if row is not None and 0 < (used := count * row.itemsize) <= len(content):
         rows = content[:used].view(row)
         (listed,) = (one for one in properties if one.length)
@@ -234,7 +234,7 @@ def _parse_lists(
     return table, place
 
 
-def _row_type(content: np.ndarray, properties: Sequence[_Property], order: str) -> np.dtype | None:
+def _find_row_type(content: np.ndarray, properties: Sequence[_Property], order: str) -> np.dtype | None:
     """Return the type of rows whose only list has the length of that in the first row, such as triangles.
 
     None for rows of other kinds. The length is the field ``NAME length``; names of properties have no spaces.

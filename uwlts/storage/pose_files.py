@@ -73,7 +73,7 @@ def read_poses(
         Names or their units contradict the format or ``unit``, or the number of columns is wrong. Numbers are not
         finite, matrices not rigid, quaternions not of unit length, or angles in rad look like degrees.
     """
-    return _poses(read_number_table(Path(path), named=False), pose_format, unit)
+    return _find_poses(read_number_table(Path(path), named=False), pose_format, unit)
 
 
 def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", unit: Unit | None = None) -> Trajectory:
@@ -93,7 +93,7 @@ def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", uni
         times, rows, covariance = read_bag_poses(path, pose_format.removeprefix("ros").removeprefix(":"))
         covariance = None if covariance is None else covariance * np.outer(_METRES, _METRES)
         rows[:, :3] *= 1e3
-        return _trajectory(path, times, poses_from_rows(rows, "quaternion-xyzw", path), covariance)
+        return _make_trajectory(path, times, poses_from_rows(rows, "quaternion-xyzw", path), covariance)
     table = read_number_table(path, named=False)
     if pose_format == "tum":
         if len(table.columns) != 8:
@@ -104,15 +104,15 @@ def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", uni
             names = ["time_s", *[*table.columns][1:]]
             table = replace(table, columns=dict(zip(names, table.columns.values(), strict=True)))
         pose_format, unit = "quaternion-xyzw", "m"
-    covariance = _covariances(table.columns, path, table.mm_per_unit(unit=unit))
-    poses, times = _poses(table, pose_format, unit)
+    covariance = _take_covariances(table.columns, path, table.mm_per_unit(unit=unit))
+    poses, times = _find_poses(table, pose_format, unit)
     if times is None:
         raise DescriptionError(f"{path} has no column time_s: a trajectory needs the time of each pose")
     if "time_s" not in table.units and np.abs(times).max(initial=0) > _LATEST_S:
         raise DescriptionError(
             f"{path} has times up to {times.max():.9g}: expected s, or a unit in the name, such as 'time [ns]'"
         )
-    return _trajectory(path, times, poses, covariance)
+    return _make_trajectory(path, times, poses, covariance)
 
 
 def holds_trajectory(path: Path) -> bool:
@@ -137,7 +137,7 @@ def write_poses(path: str | Path, poses: np.ndarray, *, overwrite: bool = False)
         aside.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
-def _covariances(columns: dict[str, np.ndarray], path: Path, mm_per_unit: float) -> np.ndarray | None:
+def _take_covariances(columns: dict[str, np.ndarray], path: Path, mm_per_unit: float) -> np.ndarray | None:
     """Remove the covariances (N, 6, 6) in mm and rad from the columns of a file, and return them; None without any."""
     found = {name: columns.pop(name) for name in [*columns] if name in COVARIANCE_COLUMNS}
     if not found:
@@ -157,7 +157,7 @@ def trajectory_path(capture: str | Path) -> Path:
     return path.with_name(path.name.removesuffix(".h5") + ".trajectory.csv")
 
 
-def _trajectory(path: Path, times: np.ndarray, poses: np.ndarray, covariance: np.ndarray | None) -> Trajectory:
+def _make_trajectory(path: Path, times: np.ndarray, poses: np.ndarray, covariance: np.ndarray | None) -> Trajectory:
     """Return a trajectory without the repetitions of a pose at the same time."""
     same = np.zeros(len(times), bool)
     same[1:] = (np.diff(times) == 0) & (poses[1:] == poses[:-1]).all(axis=(1, 2))
@@ -200,7 +200,7 @@ def _find_alternation(poses: np.ndarray) -> list[str]:
     ]
 
 
-def _poses(table: NumberTable, pose_format: PoseFormat, unit: Unit | None) -> tuple[np.ndarray, np.ndarray | None]:
+def _find_poses(table: NumberTable, pose_format: PoseFormat, unit: Unit | None) -> tuple[np.ndarray, np.ndarray | None]:
     """Return the poses (P, 4, 4) in mm of a table, and their times (P,) or None."""
     path = table.path
     columns = {name: values for name, values in table.columns.items() if name not in COVARIANCE_COLUMNS}

@@ -141,7 +141,7 @@ def mcap_content(cloud: PointCloud) -> bytes:
     text = store.generate_msgdef(_POINT_CLOUD2, ros_version=2)[0]
     schema = writer.register_schema(name=_POINT_CLOUD2, encoding="ros2msg", data=text.encode())
     channel = writer.register_channel(topic=TOPIC, message_encoding="cdr", schema_id=schema)
-    for number, (time, rows) in enumerate(_moments(cloud)):
+    for number, (time, rows) in enumerate(_split_moments(cloud)):
         message = point_cloud2(table[rows], types, time_ns=time, frame_id=FRAME_ID)
         data = bytes(store.serialize_cdr(message, _POINT_CLOUD2))
         writer.add_message(channel_id=channel, log_time=time, publish_time=time, sequence=number, data=data)
@@ -149,7 +149,7 @@ def mcap_content(cloud: PointCloud) -> bytes:
     return content.getvalue()
 
 
-def _moments(cloud: PointCloud) -> Iterator[tuple[int, np.ndarray]]:
+def _split_moments(cloud: PointCloud) -> Iterator[tuple[int, np.ndarray]]:
     """Iterate over the times in ns, and the indices of the points of each."""
     if cloud.time_s is None:
         yield 0, np.arange(len(cloud))
@@ -228,7 +228,7 @@ def read_bag_poses(path: Path, wanted: str = "") -> tuple[np.ndarray, np.ndarray
         topics = [each.topic for each in bag.connections if each.msgtype in _POSES]
         parent, is_transform, child = wanted.partition(">")
         if is_transform or not (topics or wanted):
-            found = [*_transforms(bag)]
+            found = [*_read_transforms(bag)]
             pairs, pair = {each for each, _ in found}, (parent.strip(), child.strip())
             rows = [row for each, row in found if not is_transform or each == pair]
             if not rows or (len(pairs) > 1 and not is_transform):
@@ -245,7 +245,7 @@ def read_bag_poses(path: Path, wanted: str = "") -> tuple[np.ndarray, np.ndarray
                 )
             rows = []
             for connection, message in read_messages(bag, lambda each: each.topic == topic):
-                rows.append(_row(message.header.stamp, _POSES[connection.msgtype](message)))
+                rows.append(_read_row(message.header.stamp, _POSES[connection.msgtype](message)))
                 if connection.msgtype in _WITH_COVARIANCE:
                     covariances.append(np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6))
         table, known = np.array(rows, dtype=np.float64).reshape(-1, 8), np.array(covariances)
@@ -287,15 +287,15 @@ def read_messages(bag: Any, chosen: Any) -> Any:
         yield connection, bag.deserialize(data, connection.msgtype)
 
 
-def _transforms(bag: Any) -> Any:
+def _read_transforms(bag: Any) -> Any:
     """Iterate over the frames (parent, child) and the row of every transform of the bag."""
     for _, message in read_messages(bag, lambda connection: connection.msgtype == _TRANSFORMS):
         for each in message.transforms:
             frames = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
-            yield frames, _row(each.header.stamp, each.transform)
+            yield frames, _read_row(each.header.stamp, each.transform)
 
 
-def _row(stamp: Any, pose: Any) -> tuple[float, ...]:
+def _read_row(stamp: Any, pose: Any) -> tuple[float, ...]:
     """Return time and pose of a message with position and orientation, or translation and rotation."""
     place, turn = (pose.position, pose.orientation) if hasattr(pose, "position") else (pose.translation, pose.rotation)
     return stamp.sec + 1e-9 * stamp.nanosec, place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w

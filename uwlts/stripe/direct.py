@@ -75,7 +75,7 @@ def direct_stripe(stripe: Stripe, rivals: StripeCandidates, *, jump_px: float) -
     single = np.bincount(line)[line] == 1
     before, after = np.empty((2, len(line)))
     _fit_slopes(line, centre, number, _RULE.gap_lines, before, after)
-    state = _take_best(line, _path_margins(line, centre, number, before, after, jump_px), single, _RULE.margin)
+    state = _take_best(line, _compute_path_margins(line, centre, number, before, after, jump_px), single, _RULE.margin)
     _refuse_single_runs(number, single, state)
     reach_px = _RULE.meeting_jumps * jump_px
     _open_meetings(line, centre, number, before, after, _RULE.meeting_lines, reach_px, state)
@@ -86,7 +86,7 @@ def direct_stripe(stripe: Stripe, rivals: StripeCandidates, *, jump_px: float) -
     return Stripe.from_lines(*found, status=status, stripe_along=stripe.stripe_along)
 
 
-def _path_margins(
+def _compute_path_margins(
     line: np.ndarray, centre: np.ndarray, number: np.ndarray, before: np.ndarray, after: np.ndarray, jump_px: float
 ) -> np.ndarray:
     """Return the cost (M,) of the best path through each candidate, in jumps more than the best path of all."""

@@ -124,7 +124,7 @@ def fit_low_passed(profiles: np.ndarray, stripe: Stripe, *, tolerance: float, fi
     """
     smooth, centre = apply_low_pass(profiles, tolerance=tolerance), stripe.centre_px.copy()
     lines = stripe.lines
-    centre[lines] = _peaks(smooth, lines, centre[lines], half=fitted_px // 2)
+    centre[lines] = _find_peaks(smooth, lines, centre[lines], half=fitted_px // 2)
     return replace(stripe, centre_px=centre)
 
 
@@ -136,7 +136,7 @@ def apply_low_pass(image: np.ndarray, *, tolerance: float) -> np.ndarray:
     return np.where(np.abs(grey - neighbours) > tolerance * neighbours, neighbours, grey)
 
 
-def _peaks(smooth: np.ndarray, line: np.ndarray, near_px: np.ndarray, *, half: int) -> np.ndarray:
+def _find_peaks(smooth: np.ndarray, line: np.ndarray, near_px: np.ndarray, *, half: int) -> np.ndarray:
     """Return vertices (N,) of parabolas through pixels around the maximum of columns (N,) near rows (N,)."""
     # On a plateau, the maximum nearest to the stripe's position is used.
     around = np.array(sorted(range(-_SEARCHED_PX, _SEARCHED_PX + 1), key=abs))

@@ -194,8 +194,8 @@ def measure_peak(smooth: np.ndarray, start: int, count: int, rules: SearchRules)
 
     reach = min(math.ceil(np.float32(WINDOW_RULE.background) * smooth_sigma), half - WINDOW_RULE.flank)
     near = math.floor(middle + np.float32(0.5))
-    before = _flank(smooth, near - reach - WINDOW_RULE.flank + 1)
-    after = _flank(smooth, near + reach - 1)
+    before = _estimate_flank(smooth, near - reach - WINDOW_RULE.flank + 1)
+    after = _estimate_flank(smooth, near + reach - 1)
     slope = (after - before) / np.float32(2 * reach + WINDOW_RULE.flank - 2)
     base = np.float32(0.5) * (before + after) + slope * (middle - np.float32(near))
     extent = size if rules.order == STRONGEST else reach + WINDOW_RULE.flank - 1
@@ -253,7 +253,7 @@ def _interpolate_level(low: np.floating, high: np.floating, level: np.floating) 
 
 
 @compiled_part
-def _flank(smooth: np.ndarray, first: int) -> np.float32:
+def _estimate_flank(smooth: np.ndarray, first: int) -> np.float32:
     """Return the background in a flank: the lower of two low-passed values, to ignore hot pixels."""
     first = min(max(first, 0), smooth.size - WINDOW_RULE.flank)
     return min(smooth[first + 1], smooth[first + WINDOW_RULE.flank - 1])

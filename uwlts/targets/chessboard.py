@@ -88,7 +88,7 @@ class ChessboardTarget(Target):
                 + "; columns and rows count inner corners, not squares; of a board partly in view, two adjacent sides "
                 "must be in view, and a board with cut outer squares can be placed in more than one way"
             )
-        pixels = _from_top_left(grey, part).reshape(-1, 2)
+        pixels = _rotate_to_top_left(grey, part).reshape(-1, 2)
         seen = np.isfinite(pixels[:, 0])
         pixels, indices = pixels[seen], self.indices[seen]
         return TargetView(pixels, self.points_at(indices), indices, measure_corners(image, pixels))
@@ -118,7 +118,7 @@ _DETECTORS = {
 _NEARLY_WHOLE = 0.8  # fraction of found corners above which no further detector is tried
 
 
-def _from_top_left(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
+def _rotate_to_top_left(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
     """Return the grid (rows, columns, 2) rotated to the frame of `ChessboardTarget`."""
     along, across = (np.nanmean(np.diff(grid, axis=axis), axis=(0, 1)) for axis in (1, 0))
     if along[0] * across[1] < along[1] * across[0]:

@@ -113,7 +113,7 @@ class CircleTarget(Target):
 
         circles, numbers = lattice.circles, lattice.indices
         strength = measure_marks(image, circles, mark_over_circle=self.marker_diameter_mm / self.diameter_mm)
-        origin, turn = _orientation(numbers, strength - np.median(strength), self, lattice.found)
+        origin, turn = _find_orientation(numbers, strength - np.median(strength), self, lattice.found)
         indices = (numbers - origin) @ turn + np.array(self.origin)
         places = (self.columns, self.rows)
         inside = ((indices >= 0) & (indices < places)).all(1)
@@ -154,7 +154,7 @@ def disc(point: np.ndarray, diameter_mm: float, *, ink: bool = True) -> Patch:
     return Patch(x - radius, y - radius, x + radius, y + radius, round=True, ink=ink)
 
 
-def _orientation(
+def _find_orientation(
     numbers: np.ndarray, strength: np.ndarray, target: CircleTarget, found: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices (2,) of the origin circle and the rotation (2, 2) from target steps to index steps."""
@@ -284,7 +284,7 @@ class CircleGridTarget(Target):
                 f"found {most} of {self.columns} x {self.rows} circles, which fit the grid at several places: without "
                 "marks, all its sides must be in view"
             )
-        return max((places[0] for places in best), key=lambda indices: _direction(indices, centres))
+        return max((places[0] for places in best), key=lambda indices: _find_direction(indices, centres))
 
 
 def _mask(places: np.ndarray) -> np.ndarray:
@@ -294,6 +294,6 @@ def _mask(places: np.ndarray) -> np.ndarray:
     return mask
 
 
-def _direction(indices: np.ndarray, centres: np.ndarray) -> float:
+def _find_direction(indices: np.ndarray, centres: np.ndarray) -> float:
     """Return the mean step in the image to the right, px, from a column to the next."""
     return float(np.linalg.lstsq(np.column_stack([indices, np.ones(len(indices))]), centres, rcond=None)[0][0, 0])

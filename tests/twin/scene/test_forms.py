@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from twin.scene.forms import Flange, Seabed
 from twin.scene.forms.parts import flange_face
-from twin.scene.forms.seabed import _sediment_height
+from twin.scene.forms.seabed import _compute_sediment_height
 from twin.scene.forms.triangles import add_relief, bowed_plate, rounded_box, tube
 from twin.scene.scene_object import FreeForm
 from twin.scene.surfaces import FinishProperties
@@ -21,7 +21,7 @@ def seabed_height(bed: Seabed, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     Sum of cosine ripples and smooth waves between -roughness and roughness, or the upper half of a spheroid, half as
     high as wide, where it is higher: d / 4 sqrt(1 - t^2), where t is 0 at a stone's centre and 1 at its rim.
     """
-    height = _sediment_height(bed, x, y)
+    height = _compute_sediment_height(bed, x, y)
     for (at_x, at_y), diameter in zip(bed.stone_places(), bed.stone_diameters(), strict=True):
         squared = (np.square(x - at_x) + np.square(y - at_y)) / (0.5 * diameter) ** 2
         stone = 0.25 * diameter * np.sqrt(np.maximum(1 - squared, 0))

@@ -8,7 +8,7 @@ from scipy.signal import argrelmin
 
 from twin.scene import scene_object
 from twin.scene.forms import Head, PittedPipe, Weld
-from twin.scene.forms.head import _front, _outline
+from twin.scene.forms.head import _compute_front, _compute_outline
 from twin.scene.forms.parts import pit_depths, pit_places, pitted_radius, undercut_depths, weld_height
 from twin.scene.forms.triangles import bowed_plate
 from uwlts.errors import DescriptionError
@@ -19,10 +19,10 @@ HEIGHT = 160.0
 def head_depth(x: np.ndarray, y: np.ndarray, *, height_mm: float) -> np.ndarray:
     """Return z of the front of a head at ``x``, ``y`` (N,), all in mm; NaN outside its outline."""
     x, y = x / height_mm, y / height_mm
-    half_width, front, _ = _outline(y)
+    half_width, front, _ = _compute_outline(y)
     with np.errstate(divide="ignore", invalid="ignore"):
         facing = np.sqrt(1 - np.square(x / half_width))
-    return height_mm * np.where(np.abs(y) <= 0.5, _front(x, y, front, facing), np.nan)
+    return height_mm * np.where(np.abs(y) <= 0.5, _compute_front(x, y, front, facing), np.nan)
 
 
 def mesh_of(surface: tuple[np.ndarray, np.ndarray]) -> trimesh.Trimesh:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from uwlts.comparison.local_means import TWO_SIDED, _student_ratio, average_locally
+from uwlts.comparison.local_means import TWO_SIDED, _compute_student_ratio, average_locally
 from uwlts.registration.surface_registration import SurfaceSample
 from uwlts.storage.cloud import PointUncertainty
 
@@ -44,7 +44,7 @@ def test_means_do_not_depend_on_how_many_pairs_are_averaged_at_once(monkeypatch:
 def test_the_factor_of_few_points_is_students() -> None:
     """Quantiles of 97.5 % for 1, 4, 10 and 30 degrees of freedom, from tables."""
     tabulated = np.array([12.706, 2.776, 2.228, 2.042])
-    np.testing.assert_allclose(_student_ratio(np.array([2, 5, 11, 31])), tabulated / TWO_SIDED, rtol=2e-4)
+    np.testing.assert_allclose(_compute_student_ratio(np.array([2, 5, 11, 31])), tabulated / TWO_SIDED, rtol=2e-4)
 
 
 def images(values: np.ndarray, each: int) -> tuple[np.ndarray, np.ndarray]:

@@ -15,8 +15,8 @@ from uwlts.inspection.blemishes import (
     NotSignificantError,
     _Bell,
     _interpolation_rows,
+    _make_quadratic_rows,
     _measure_section,
-    _quadratic_rows,
     measure_blemish,
 )
 from uwlts.inspection.features import FeatureValue
@@ -120,10 +120,10 @@ def test_interpolation_and_smoothing_are_exact_for_quadratics() -> None:
     np.testing.assert_allclose(rows @ quadratic(u, v), quadratic(*inner.T))
     assert not (_interpolation_rows(np.array([[-5.0, 3.0], [4.0, 40.0]]), shape) @ quadratic(u, v)).any()
     places = rng.uniform(-1, 10, (1500, 2))
-    smooth = _quadratic_rows(inner, places, KDTree(places), 1.2)
+    smooth = _make_quadratic_rows(inner, places, KDTree(places), 1.2)
     np.testing.assert_allclose(smooth @ quadratic(*places.T), quadratic(*inner.T))
     # Fewer than nine points in the window: the mean of the three nearest.
-    few = _quadratic_rows(np.zeros((1, 2)), places[:40] + 50.0, KDTree(places[:40] + 50.0), 1.2)
+    few = _make_quadratic_rows(np.zeros((1, 2)), places[:40] + 50.0, KDTree(places[:40] + 50.0), 1.2)
     nearest = np.argsort(np.hypot(*(places[:40] + 50.0).T))[:3]
     assert (few @ np.arange(40.0))[0] == pytest.approx(nearest.mean())
 

@@ -12,7 +12,7 @@ from scipy.interpolate import CubicSpline
 
 import uwlts
 from uwlts.model.phase_functions import FournierForand, HenyeyGreenstein, PetzoldAverage, PhaseFunction
-from uwlts.radiometry.fit import _NAMES, _OTHER_PHASES, _Evidence, _natural_absorption
+from uwlts.radiometry.fit import _NAMES, _OTHER_PHASES, _bound_natural_absorption, _Evidence
 from uwlts.radiometry.followed_sensor import follow_sensor
 from uwlts.radiometry.result import format_value
 from uwlts.radiometry.stripe_images import BLOCKS, GROUP_LINES, TAIL_PX, StripeImages
@@ -126,7 +126,7 @@ def test_a_reflectance_with_the_path_shows_if_no_natural_water_absorbs_so_much()
     """The light doubles or halves over the 260 mm of path: the attenuation changes by ln 2 / 0.26 m = 2.7/m."""
     sensor = uwlts.load_sensor("thesis-small")
     headers: list[Any] = [SimpleNamespace(sensor=sensor, medium=sensor.medium(name)) for name in ("water", "air")]
-    water, air = map(_natural_absorption, headers)
+    water, air = map(_bound_natural_absorption, headers)
     assert water == pytest.approx(NATURAL, abs=2e-3) and air == (0.0, math.inf)
     evidence = draw(np.random.default_rng(6))
     doubled = 2 ** ((evidence.paths - 750) / 260)

@@ -6,7 +6,7 @@ import pytest
 from uwlts.fitting.patches import surface_patches
 from uwlts.registration.joint_registration import JointRegistration, PairEvidence
 from uwlts.registration.marker_spheres import MarkerSphere
-from uwlts.registration.register import _closure_rms
+from uwlts.registration.register import _compute_closure_rms
 from uwlts.storage.cloud import PointUncertainty
 
 OWN = 1e-4  # variance of an amplitude that no other scan shares
@@ -101,10 +101,10 @@ def test_the_closure_of_a_pair_is_what_the_others_leave() -> None:
     step, pair = -np.linalg.lstsq(design, values)[0], pairs[0, 2]
     left = (pair.residuals + pair.derivatives @ step)[1:]
     expected = np.sqrt(np.mean(left**2) - np.mean(pair.std[1:] ** 2))
-    assert _closure_rms(joint, (0, 2), pairs, solution) == pytest.approx(expected)
+    assert _compute_closure_rms(joint, (0, 2), pairs, solution) == pytest.approx(expected)
     # Without the overlap of the last two, nothing determines the third.
-    assert _closure_rms(joint, (0, 2), {(0, 1): pairs[0, 1], (0, 2): pair}, solution) is None
-    assert _closure_rms(joint, (0, 2), {(0, 2): pair}, solution) is None
+    assert _compute_closure_rms(joint, (0, 2), {(0, 1): pairs[0, 1], (0, 2): pair}, solution) is None
+    assert _compute_closure_rms(joint, (0, 2), {(0, 2): pair}, solution) is None
 
 
 def test_common_spheres_are_observed_as_their_centres_differ() -> None:

@@ -19,7 +19,7 @@ from uwlts.errors import CaptureError, DescriptionError, EvaluationError
 from uwlts.model.sensor import Medium
 from uwlts.report.certificate import Certificate, CertifiedFile, ParameterRow, Validity
 from uwlts.report.certificate_volume import LengthUncertainty
-from uwlts.report.digital_certificate import DCC, SI, UNITS, _decimal, digital_certificate, load_administration
+from uwlts.report.digital_certificate import DCC, SI, UNITS, _format_decimal, digital_certificate, load_administration
 
 ADMINISTRATION = """
 identifier = "UW-7"
@@ -213,14 +213,14 @@ def test_digits_are_those_of_the_uncertainty(seed):
     """Two significant digits of the uncertainty, and as many decimals of the value: both are within half a digit."""
     rng = np.random.default_rng([98, seed])
     expanded, value = 10 ** rng.uniform(-8, 3), rng.uniform(-1, 1) * 10 ** rng.uniform(-2, 4)
-    texts = _decimal(expanded, expanded), _decimal(value, expanded)
+    texts = _format_decimal(expanded, expanded), _format_decimal(value, expanded)
     digit = Decimal(f"{expanded:.1e}").as_tuple().exponent
     for text, exact in zip(texts, (expanded, value), strict=True):
         assert re.fullmatch(DECIMAL, text)
         assert abs(float(text) - exact) <= 0.5001 * 10.0**digit
         assert Decimal(text).as_tuple().exponent == min(digit, 0)
-    assert _decimal(0.0996, 0.0996) == "0.10" and _decimal(1234.4, 120.0) == "1230"
-    assert _decimal(1.52, None) == "1.52"
+    assert _format_decimal(0.0996, 0.0996) == "0.10" and _format_decimal(1234.4, 120.0) == "1230"
+    assert _format_decimal(1.52, None) == "1.52"
 
 
 CIRCLES, STEP = {"target": {"kind": "circles"}}, {"step_captures": [{}]}

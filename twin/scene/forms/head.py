@@ -53,20 +53,20 @@ class Head(FreeForm):
 
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
         """Return a closed surface, scaled to its height: 0.57 wide, and 0.79 from nose to back."""
-        vertices, faces = _unit_triangles()
+        vertices, faces = _make_unit_triangles()
         return self.height_mm * vertices, faces
 
 
-def _unit_triangles() -> tuple[np.ndarray, np.ndarray]:
+def _make_unit_triangles() -> tuple[np.ndarray, np.ndarray]:
     # Rows at equal distances along the front outline, from the crown, where it is level, to the neck.
     y = 0.5 - np.square(np.linspace(0, 1, 20 * _ROWS))
-    way = np.concatenate([[0], np.cumsum(np.hypot(np.diff(y), np.diff(_outline(y)[1])))])
+    way = np.concatenate([[0], np.cumsum(np.hypot(np.diff(y), np.diff(_compute_outline(y)[1])))])
     y = np.interp(np.linspace(0, way[-1], _ROWS + 1), way, y)[1:, None]
     angle = np.linspace(-np.pi, np.pi, _COLUMNS, endpoint=False)
     angle = angle - _FINER_IN_FRONT * np.sin(angle)
-    half_width, front, back = _outline(y)
+    half_width, front, back = _compute_outline(y)
     x, facing = half_width * np.sin(angle), np.broadcast_to(np.cos(angle), (_ROWS, _COLUMNS))
-    z = np.where(facing > 0, _front(x, y, front, facing), -back * facing)
+    z = np.where(facing > 0, _compute_front(x, y, front, facing), -back * facing)
     sides = np.stack([x, np.broadcast_to(y, x.shape), z], axis=-1).reshape(-1, 3)
 
     ring = np.arange(_COLUMNS)
@@ -82,14 +82,14 @@ def _unit_triangles() -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([sides, [[0, 0.5, 0], [0, -0.5, 0]]]), faces
 
 
-def _outline(y: np.ndarray) -> np.ndarray:
+def _compute_outline(y: np.ndarray) -> np.ndarray:
     """Return half width, front and back (3, ...) of the head at heights y (...), as a smooth union of its bodies."""
     middle, half, flatness, *radii = (column[:, *[None] * np.ndim(y)] for column in _BODIES.T)
     share = np.sqrt(np.maximum(1 - np.abs((y - middle) / half) ** flatness, 0))
     return np.stack([np.sum((radius * share) ** _UNION_POWER, axis=0) ** (1 / _UNION_POWER) for radius in radii])
 
 
-def _front(x: np.ndarray, y: np.ndarray, front: np.ndarray, facing: np.ndarray) -> np.ndarray:
+def _compute_front(x: np.ndarray, y: np.ndarray, front: np.ndarray, facing: np.ndarray) -> np.ndarray:
     """Return z of the face; ``facing`` (1 in the middle, 0 at the sides) fades the features out."""
     relief = sum(
         height * np.exp(-0.5 * (np.square((x - side * at_x) / sigma_x) + np.square((y - at_y) / sigma_y)))

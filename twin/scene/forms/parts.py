@@ -91,7 +91,7 @@ class Weld(FreeForm):
         step = chord_step(_SAG_MM, 1.3 * ripple + toe + undercut)
         plate = self.plate_mm if self.along == "x" else self.plate_mm[::-1]
         along = nodes([0.0], 0.5 * self.length_mm, step=step, length=plate[0])
-        across = nodes(_bead_middles(self), self.bead_reach_mm(), step=step, length=plate[1])
+        across = nodes(_place_beads(self), self.bead_reach_mm(), step=step, length=plate[1])
         advice = "make its ripples longer or lower, or its beads fewer or shorter"
         require_few_vertices(len(along) * len(across), step_mm=step, advice=advice)
         x, y = np.meshgrid(*((along, across) if self.along == "x" else (across, along)), indexing="ij")
@@ -121,7 +121,7 @@ def weld_height(weld: Weld, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """
     along, across = (x, y) if weld.along == "x" else (y, x)
     height = np.zeros(np.broadcast(x, y).shape)
-    for number, (middle, grooves) in enumerate(zip(_bead_middles(weld), undercut_depths(weld), strict=True)):
+    for number, (middle, grooves) in enumerate(zip(_place_beads(weld), undercut_depths(weld), strict=True)):
         rng = np.random.default_rng([weld.seed, number])
         swell, thickness, sway, hurry = (weld.irregularity * wave(along / weld.width_mm, rng) for _ in range(4))
         sideways = (across - middle - weld.width_mm * sway) / (0.5 * weld.width_mm * (1 + swell))
@@ -137,7 +137,7 @@ def weld_height(weld: Weld, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return height
 
 
-def _bead_middles(weld: Weld) -> np.ndarray:
+def _place_beads(weld: Weld) -> np.ndarray:
     """Return the positions (beads,) of the beads' centre lines across them."""
     return weld.spacing_mm * (np.arange(weld.beads) - 0.5 * (weld.beads - 1))
 

@@ -65,21 +65,21 @@ class Seabed(FreeForm):
         step = chord_step(_SAG_MM, max(curvature, 8 * _SAG_MM / min(self.width_mm, self.height_mm) ** 2))
         columns, rows = (int(np.ceil(side / step)) + 1 for side in (self.width_mm, self.height_mm))
         diameters = self.stone_diameters()
-        count = rows * columns + sum(int(np.prod(_stone_facets(each))) for each in diameters)
+        count = rows * columns + sum(int(np.prod(_count_stone_facets(each))) for each in diameters)
         require_few_vertices(count, step_mm=step, advice="make it smaller, its ripples longer, or its stones fewer")
         x, y = (np.linspace(-0.5, 0.5, count) for count in (columns, rows))
         x, y = np.meshgrid(x * self.width_mm, y * self.height_mm, indexing="ij")
-        vertices = [np.stack([x, y, -_sediment_height(self, x, y)], axis=-1).reshape(-1, 3)]
+        vertices = [np.stack([x, y, -_compute_sediment_height(self, x, y)], axis=-1).reshape(-1, 3)]
         faces, used = [grid_faces(x.shape)], x.size
         for place, diameter in zip(self.stone_places(), diameters, strict=True):
-            points, facets = _stone(diameter)
+            points, facets = _make_stone(diameter)
             vertices.append(points + (*place, 0.0))
             faces.append(facets + used)
             used += len(points)
         return np.concatenate(vertices), np.concatenate(faces)
 
 
-def _stone_facets(diameter_mm: float) -> tuple[int, int]:
+def _count_stone_facets(diameter_mm: float) -> tuple[int, int]:
     """Return the number of rings from a stone's rim to its top, and of facets around it.
 
     On an ellipse with the larger half axis a, a chord over the parameter angle p deviates by at most a p^2 / 8.
@@ -88,9 +88,9 @@ def _stone_facets(diameter_mm: float) -> tuple[int, int]:
     return int(np.ceil(0.5 * np.pi / angle)) + 1, int(np.ceil(2 * np.pi / angle))
 
 
-def _stone(diameter_mm: float) -> tuple[np.ndarray, np.ndarray]:
+def _make_stone(diameter_mm: float) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (V, 3) and faces (F, 3) of the upper half of a spheroid, half as high as wide."""
-    rings, around = _stone_facets(diameter_mm)
+    rings, around = _count_stone_facets(diameter_mm)
     angle = np.linspace(0, 0.5 * np.pi, rings)
     radius = np.tile(0.5 * diameter_mm * np.cos(angle)[:, None], around)
     turns = np.linspace(0, 2 * np.pi, around, endpoint=False)
@@ -102,7 +102,7 @@ def _stone(diameter_mm: float) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([vertices[:, 2], vertices[:, 1], -vertices[:, 0]], axis=1)[: (rings - 1) * around + 1], faces
 
 
-def _sediment_height(bed: Seabed, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _compute_sediment_height(bed: Seabed, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return the height of the sea floor without stones."""
     places = np.stack(np.broadcast_arrays(x, y)) / bed.ripple_pitch_mm
     height = 0.5 * bed.ripple_height_mm * np.cos(2 * np.pi * places[0])

@@ -194,7 +194,7 @@ def _split_edges(values: np.ndarray, faces: np.ndarray, longest: float) -> tuple
     while len(faces) or len(strips):
         ends = [np.stack([cells, np.roll(cells, -1, axis=1)], -1).reshape(-1, 2) for cells in (faces, strips)]
         first, second = (order(*np.concatenate(ends).T) for order in (np.minimum, np.maximum))
-        long = sum(np.square(axis[first] - axis[second]) for axis in values.T[:3].copy()) > longest**2
+        long = np.square(values[first, :3] - values[second, :3]).sum(axis=1) > longest**2
         edges, number = np.unique(first[long] * len(values) + second[long], return_inverse=True)
         middle = np.full(len(long), -1)
         middle[long] = len(values) + number

@@ -71,17 +71,17 @@ class Intrinsics:
         """Estimated parameters."""
         return tuple(key for name in self.names for key in LensParameter if key.text == name)
 
-    def _all(self, estimated: np.ndarray) -> np.ndarray:
+    def _complete(self, estimated: np.ndarray) -> np.ndarray:
         return self.fixed + self.map @ estimated
 
     def matrix(self, estimated: np.ndarray) -> np.ndarray:
         """Return the camera matrix K (3, 3)."""
-        fx, fy, cx, cy = self._all(estimated)[:4]
+        fx, fy, cx, cy = self._complete(estimated)[:4]
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
     def coefficients(self, estimated: np.ndarray) -> np.ndarray:
         """Return the distortion coefficients (8,) in OpenCV's order."""
-        return self._all(estimated)[4:]
+        return self._complete(estimated)[4:]
 
     def from_matrix(self, matrix: np.ndarray) -> np.ndarray:
         """Return start values (P,) from a camera matrix of any skew and aspect, without distortion."""
@@ -96,7 +96,7 @@ class Intrinsics:
 
     def model(self, estimated: np.ndarray) -> CameraModel:
         """Return the camera model."""
-        fx, fy, cx, cy, *coefficients = self._all(estimated).tolist()
+        fx, fy, cx, cy, *coefficients = self._complete(estimated).tolist()
         return CameraModel(
             width_px=self.width_px,
             height_px=self.height_px,

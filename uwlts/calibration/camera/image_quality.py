@@ -63,10 +63,10 @@ class StripeQuality:
 def judge_target(image: np.ndarray, view: TargetView, target: Target, *, full_dn: int) -> TargetQuality:
     """Assess an image (H, W) in which the points of ``view`` were found; ``full_dn`` is the value of saturation."""
     count, of_all = len(view.pixels), len(target.indices)
-    blur = edge_blur_px(image, view.pixels, half_px=_spacing_px(view, target) / 2)
+    blur = edge_blur_px(image, view.pixels, half_px=_measure_spacing_px(view, target) / 2)
     contrast = float(np.median(view.quality["contrast"])) / full_dn
     covered = np.zeros(image.shape, np.uint8)
-    cv2.fillConvexPoly(covered, np.rint(_hull(view.pixels)).astype(np.int32), 1)
+    cv2.fillConvexPoly(covered, np.rint(_find_hull(view.pixels)).astype(np.int32), 1)
     saturated = float(np.mean(image[covered > 0] >= full_dn))
     reasons = {
         f"partial: {count} of {of_all} points found; bring more of the target into the image": (
@@ -158,7 +158,7 @@ def judge_stripe(
     except ImageError as error:
         return StripeQuality(np.empty((0, 2)), (str(error),))
     found, pixels = stripe.status == StripeStatus.OK, stripe.pixels()
-    outline = _hull(view.pixels, margin_px=_spacing_px(view, target)).astype(np.float32)
+    outline = _find_hull(view.pixels, margin_px=_measure_spacing_px(view, target)).astype(np.float32)
     on_target = [cv2.pointPolygonTest(outline, (float(u), float(v)), False) >= 0 for u, v in pixels]
     brightest = image.max(axis=0 if stripe_along == "width" else 1)
     clipped = (brightest >= full_dn) & (found | (stripe.status == StripeStatus.SATURATED))
@@ -170,14 +170,14 @@ def judge_stripe(
     return StripeQuality(pixels[np.array(on_target, dtype=bool)], reasons)
 
 
-def _hull(pixels: np.ndarray, *, margin_px: float = 0.0) -> np.ndarray:
+def _find_hull(pixels: np.ndarray, *, margin_px: float = 0.0) -> np.ndarray:
     """Return the corners (K, 2) of the points' convex hull, expanded by a margin."""
     hull = cv2.convexHull(pixels.astype(np.float32))[:, 0]
     outward = hull - hull.mean(axis=0)
     return hull + margin_px * outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
 
 
-def _spacing_px(view: TargetView, target: Target) -> float:
+def _measure_spacing_px(view: TargetView, target: Target) -> float:
     """Return the approximate distance of neighbouring points in the image."""
     size_px, size_mm = np.ptp(view.pixels, axis=0).max(), np.ptp(view.points_mm[:, :2], axis=0).max()
     return float(target.spacing_mm * size_px / max(size_mm, 1e-9))

@@ -184,8 +184,8 @@ def calibrate_lens(
 
     solve_centres = partial(solve_camera, width_px=width_px, height_px=height_px, poses=poses, approaching=approaching)
     solve = partial(solve_centres, circle_diameter_mm=circle_diameter_mm)
-    tried = _candidates(DISTORTIONS, choice, poses)
-    usual = tried[0] if len(tried) == 1 else _candidates((_USUAL,), replace(choice, distortion="auto"), poses)[0]
+    tried = _list_candidates(DISTORTIONS, choice, poses)
+    usual = tried[0] if len(tried) == 1 else _list_candidates((_USUAL,), replace(choice, distortion="auto"), poses)[0]
 
     plain = solve(images, options=usual)
     wide = choice.distortion == "auto" and poses != "stage-normal" and _find_widest_deg(images, plain) > WIDE_DEG
@@ -216,7 +216,7 @@ def calibrate_lens(
     if len(tried) > 1 and len(good) > _FEWEST_IMAGES:
         centred = _correct_circles(good, solve(good, options=usual))
         squares: dict[CameraOptions, np.ndarray] = {}
-        for further in (tried, _candidates(RATIONAL, choice, poses)):
+        for further in (tried, _list_candidates(RATIONAL, choice, poses)):
             for number, each in enumerate(further):
                 squares[each] = _cross_validate(centred, partial(solve_centres, options=each))
                 progress(number + 1, len(further))
@@ -287,7 +287,7 @@ def calibrate_lens(
     )
 
 
-def _candidates(any_of: Sequence[tuple[str, ...]], choice: LensChoice, poses: Poses) -> list[CameraOptions]:
+def _list_candidates(any_of: Sequence[tuple[str, ...]], choice: LensChoice, poses: Poses) -> list[CameraOptions]:
     any_of = (_USUAL,) if poses == "stage-normal" else any_of
     sets = any_of if choice.distortion == "auto" else (choice.distortion,)
     known = choice.pixel_aspect
@@ -324,7 +324,7 @@ def _cross_validate(images: list[TargetImage], solve: Callable[[Sequence[TargetI
         for fold in range(folds):
             model = solve([image for place, image in enumerate(images) if place % folds != fold]).model
             for place in range(fold, len(images), folds):
-                squares[place] = _mean_square_miss(model, images[place])
+                squares[place] = _compute_mean_square_miss(model, images[place])
     except CalibrationError:
         squares[:] = np.nan
     return squares
@@ -350,7 +350,7 @@ def compare_models(squares: dict[CameraOptions, np.ndarray], *, least_gain: floa
     return found
 
 
-def _mean_square_miss(model: CameraModel, image: TargetImage) -> float:
+def _compute_mean_square_miss(model: CameraModel, image: TargetImage) -> float:
     """Return the mean square distance of an image's points from their prediction, with the best-fitting pose."""
     matrix, coefficients = model.matrix(), model.coefficients()
     pose = find_pose(image.points_mm, image.pixels, matrix, coefficients)

@@ -230,14 +230,14 @@ def solve_camera(
 
         def model(group: int, global_values: np.ndarray, local: np.ndarray) -> Observation | None:
             if group == len(views):
-                return _prior_observation(intrinsics, global_values)
+                return _make_prior_observation(intrinsics, global_values)
             return observe(views[group], intrinsics, global_values, local)
 
         if options.tangential is not None:
             local = [*local, np.empty(0)]
         fit = schur_least_squares(model, global_values, local, soft_limit=options.soft_limit_px)
         _refuse_undetermined(fit, intrinsics)
-        return _solution(images, views, fit, intrinsics, poses)
+        return _make_solution(images, views, fit, intrinsics, poses)
 
     if circle_diameter_mm is None:
         return solve(images, start)
@@ -258,7 +258,7 @@ def solve_camera(
     )
 
 
-def _prior_observation(intrinsics: Intrinsics, global_values: np.ndarray) -> Observation:
+def _make_prior_observation(intrinsics: Intrinsics, global_values: np.ndarray) -> Observation:
     """Return the prior knowledge of p1 and p2 as residuals in px."""
     std, sigma_px = intrinsics.options.tangential or (math.inf, 0.0)
     by_global = np.array([[float(name == key) for name in intrinsics.names] for key in ("p1", "p2")]) * (sigma_px / std)
@@ -321,7 +321,7 @@ def _refuse_undetermined(fit: SchurFit, intrinsics: Intrinsics) -> None:
             )
 
 
-def _solution(
+def _make_solution(
     images: Sequence[TargetImage], views: list[Placement], fit: SchurFit, intrinsics: Intrinsics, poses: Poses
 ) -> CameraSolution:
     target_poses, directions, tilts = np.tile(np.eye(4), (len(images), 1, 1)), [], []

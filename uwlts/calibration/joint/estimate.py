@@ -259,10 +259,10 @@ def estimate_noise(kind: str, residuals: Sequence[Residuals], points: Sequence[n
     if kind == TARGET:
         places = np.vstack(points)[:, :2]
         together = max(
-            _point_variance_factor(values, places, kept, sigma), _image_variance_factor(residuals, places, sigma)
+            _find_point_variance_factor(values, places, kept, sigma), _image_variance_factor(residuals, places, sigma)
         )
     else:
-        together = _neighbour_variance_factor(residuals, sigma)
+        together = _find_neighbour_variance_factor(residuals, sigma)
     return Noise(sigma, max(together, 1.0))
 
 
@@ -272,7 +272,7 @@ def add_common_error(noise: Noise, common_px: np.ndarray, *, bodies: float) -> N
     return Noise(noise.sigma_px, noise.together, points_per_body * common / noise.sigma_px**2)
 
 
-def _point_variance_factor(values: np.ndarray, places: np.ndarray, kept: np.ndarray, sigma: float) -> float:
+def _find_point_variance_factor(values: np.ndarray, places: np.ndarray, kept: np.ndarray, sigma: float) -> float:
     """Return the variance factor of residuals of the same point in several images, from their correlation."""
     _, point = np.unique(np.round(places, 6), axis=0, return_inverse=True)
     pairs, kept = values.reshape(-1, 2), np.all(kept.reshape(-1, 2), axis=1)
@@ -305,7 +305,7 @@ def _image_variance_factor(residuals: Sequence[Residuals], places: np.ndarray, s
     return float(np.median(found)) if found else 1.0
 
 
-def _neighbour_variance_factor(residuals: Sequence[Residuals], sigma: float) -> float:
+def _find_neighbour_variance_factor(residuals: Sequence[Residuals], sigma: float) -> float:
     """Return the variance factor 1 + 2 sum of the autocorrelation along the stripe, over all images."""
     products, counts = np.zeros(_LAGS), np.zeros(_LAGS)
     for part in residuals:

@@ -155,7 +155,7 @@ def estimate_series_start(
         lens = intrinsics.from_model(CameraModel.from_description(sensor.camera))
     else:
         base = min(series, key=lambda s: (s.view.medium is not None, s.view.window, -len(s.found.images)))
-        solve = _camera_solver(base, sensor, options)
+        solve = _make_camera_solver(base, sensor, options)
         try:
             seen = solve(base.found.images, options=camera)
         except CalibrationError:  # coefficients that are not determined start at zero
@@ -186,7 +186,7 @@ def estimate_series_start(
     return start
 
 
-def _camera_solver(series: Series, sensor: Sensor, options: CalibrationOptions) -> Callable[..., CameraSolution]:
+def _make_camera_solver(series: Series, sensor: Sensor, options: CalibrationOptions) -> Callable[..., CameraSolution]:
     """Return the function that calibrates a camera without a window from images of a series."""
     return partial(
         solve_camera,
@@ -206,7 +206,7 @@ def find_odd_images(series: Series, sensor: Sensor, *, options: CalibrationOptio
 
     Of many draws of a few images, those that a camera fits best are taken to be right; each other image is added alone.
     """
-    solve, images = _camera_solver(series, sensor, options), series.found.images
+    solve, images = _make_camera_solver(series, sensor, options), series.found.images
     if len(images) <= _DRAWN:
         return {}
     pinhole, rng = CameraOptions((), sensor.camera.pixel_aspect), np.random.default_rng(0)

@@ -300,8 +300,8 @@ class TargetEvidence(StripeEvidence):
             return None
         start, along = pose.to_target_frame(rays.origins), pose.rotation.T @ rays.directions
         known = self.placement.points_mm[here]
-        bends = self._bends(known)
-        reach = (_values(parameters, global_values, BENDS) @ bends - start[2]) / along[2]
+        bends = self._compute_bends(known)
+        reach = (_list_values(parameters, global_values, BENDS) @ bends - start[2]) / along[2]
         if not (reach > 0).all():
             return None
         at = rays.origins + reach * rays.directions
@@ -312,7 +312,7 @@ class TargetEvidence(StripeEvidence):
             return moved[..., :2, :] - slope * moved[..., 2:, :]
 
         by_rays = flat(pose.rotation.T @ (rays.origins_by + reach * rays.directions_by))
-        stretch = 1.0 + _values(parameters, global_values, STRETCH)
+        stretch = 1.0 + _list_values(parameters, global_values, STRETCH)
         found = (start + reach * along)[:2] - stretch[:, None] * known[:, :2].T
         into = np.linalg.inv(by_rays[:2].transpose(2, 1, 0))  # (N, 2 pixel, 2 target), maps target mm to px
 
@@ -340,7 +340,7 @@ class TargetEvidence(StripeEvidence):
         if points is None:
             return None
         at = pose.to_target_frame(points.points)
-        bends, sizes = self._bends(at.T), _values(parameters, global_values, BENDS)
+        bends, sizes = self._compute_bends(at.T), _list_values(parameters, global_values, BENDS)
         bow, saddle, twist = sizes
         # Gradient of the height above the bent target, in the target's frame.
         steep = -2.0 / self.radius_mm**2 * np.array([[bow + saddle, twist], [twist, bow - saddle]])
@@ -360,13 +360,13 @@ class TargetEvidence(StripeEvidence):
         )
         return pose.split_by_image(STRIPE, every.values, every.by_global, every.by_local)
 
-    def _bends(self, points: np.ndarray) -> np.ndarray:
+    def _compute_bends(self, points: np.ndarray) -> np.ndarray:
         """Return heights (3, N) of target points (N, 2 or 3) for a unit bow, a unit saddle, and a unit twist."""
         x, y = ((points[:, :2] - self.middle_mm) / self.radius_mm).T
         return np.stack([x**2 + y**2, x**2 - y**2, 2 * x * y])
 
 
-def _values(parameters: Parameters, global_values: np.ndarray, keys: tuple[ParameterKey, ...]) -> np.ndarray:
+def _list_values(parameters: Parameters, global_values: np.ndarray, keys: tuple[ParameterKey, ...]) -> np.ndarray:
     return np.array([parameters.value(global_values, key) for key in keys])
 
 

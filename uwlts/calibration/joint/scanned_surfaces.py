@@ -66,7 +66,7 @@ class ScannedSpheres:
 
     def distances(self, points: np.ndarray, local: np.ndarray) -> Distances:
         """Return the distances of points (3, N) of the scan's pixels, in their order."""
-        offset = points - self._centres(local)[self.sphere].T
+        offset = points - self._read_centres(local)[self.sphere].T
         distance = np.linalg.norm(offset, axis=0)
         outward = offset / distance
         radius = 0.5 * (self.diameters_mm + local[3 * self.count :])[self.sphere]
@@ -78,7 +78,7 @@ class ScannedSpheres:
 
     def sizes(self, local: np.ndarray) -> Sizes:
         """Return the described sizes; empty for a surface without a size."""
-        differences = np.diff(self._centres(local), axis=0)
+        differences = np.diff(self._read_centres(local), axis=0)
         length = np.linalg.norm(differences, axis=1)
         by_local = np.zeros((self.count + len(length), len(local)))
         by_local[: self.count, 3 * self.count :] = np.eye(self.count)
@@ -101,7 +101,7 @@ class ScannedSpheres:
         unknown = {name: np.full_like(getattr(self, name), np.inf) for name in ("diameter_std_mm", "spacing_std_mm")}
         return replace(self, **unknown)
 
-    def _centres(self, local: np.ndarray) -> np.ndarray:
+    def _read_centres(self, local: np.ndarray) -> np.ndarray:
         return local[: 3 * self.count].reshape(-1, 3)
 
 

@@ -49,7 +49,7 @@ def build_calibration(
         sheet=sheet,
         camera_from_object=to_rows(frame),
         media=tuple(KnownMedium(medium=m, index=index) for m, index in zip(media, indices, strict=True)),
-        residuals=_lens_and_window(result),
+        residuals=_list_lens_and_window(result),
         joint=_build_joint_estimate(result, evidence, frame),
         provenance=provenance,
     )
@@ -95,7 +95,7 @@ def _build_joint_estimate(result: Estimate, evidence: Sequence[Evidence], object
     )
 
 
-def _lens_and_window(result: Estimate) -> dict[str, Table]:
+def _list_lens_and_window(result: Estimate) -> dict[str, Table]:
     """Return standard uncertainties of lens and window, with the names of sequential calibrations in files."""
     std = result.std()
     camera: Table = {"std": {key.text: std[key] for key in std if isinstance(key, LensParameter)}}
@@ -229,7 +229,7 @@ def _read_estimate(
     intrinsics = Intrinsics(options, width_px=camera.width_px, height_px=camera.height_px)
     media = [key.medium for key in keys if isinstance(key, MediumIndex)]
     if len(media) != len(calibration.media):
-        raise _damage_error(f"it has {len(media)} indices for {len(calibration.media)} media")
+        raise _make_damage_error(f"it has {len(media)} indices for {len(calibration.media)} media")
     # As in `Calibration.medium_index`: the last of equal media.
     known = next((n for n, found in reversed([*enumerate(calibration.media)]) if found.medium == medium), None)
     seen_in = None if medium.kind == "air" else known
@@ -245,7 +245,7 @@ def _read_estimate(
         covariance = append_independent(covariance, [medium.index_uncertainty(calibration.wavelength_nm, uncertainty)])
     lens = len(intrinsics.names)
     if tuple(keys[:lens]) != intrinsics.keys:
-        raise _damage_error("its parameters are inconsistent with the camera")
+        raise _make_damage_error("its parameters are inconsistent with the camera")
     # Fixed parameters of window and sheet are read from the calibration's models.
     held = {} if calibration.window is None else window_values(calibration.window)
     if (fan := calibration.sheet.fan) is not None:
@@ -258,5 +258,5 @@ def _read_estimate(
     return StoredEstimate(calibration, parameters, values, covariance, view)
 
 
-def _damage_error(reason: str) -> CalibrationError:
+def _make_damage_error(reason: str) -> CalibrationError:
     return CalibrationError(f"the calibration's joint estimate is damaged: {reason}")

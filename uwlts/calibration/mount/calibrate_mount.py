@@ -172,10 +172,10 @@ def calibrate_mount(
     try:
         return _Calibration(evidence, captured).make_result()
     except (NoFit, NotSettled) as error:
-        raise CalibrationError(f"{error}. {_advice(evidence)}") from error
+        raise CalibrationError(f"{error}. {_make_advice(evidence)}") from error
 
 
-def _advice(evidence: MountEvidence) -> str:
+def _make_advice(evidence: MountEvidence) -> str:
     """Return advice on the usual mistakes; a wrong radius is tested by estimating it."""
     if evidence.options.radius_mm is not None:
         unknown = evidence.options.model_copy(update={"radius_mm": None})
@@ -205,7 +205,7 @@ class _Calibration:
         self.rows = [thin(np.flatnonzero(np.isfinite(each).all(axis=1)), most) for each in evidence.profiles]
         chosen = [each[rows] for each, rows in zip(evidence.profiles, self.rows, strict=True)]
         self.profiles = [each if each.shape[1] == 3 else from_sheet(each) for each in chosen]
-        self.sheet = _sheet_frame(self.profiles)
+        self.sheet = _find_sheet_frame(self.profiles)
         self.flat = to_sheet(self.profiles, self.sheet)
         self.reasons: dict[int, str] = {}
 
@@ -229,7 +229,7 @@ class _Calibration:
         self._require_enough(len(seen))
         whole = Problem(
             self.profiles,
-            _motion(self.evidence),
+            _make_motion(self.evidence),
             self.sheet[:3, 1],
             self.shape,
             self.evidence.options.scale,
@@ -273,7 +273,7 @@ class _Calibration:
         self._require_fit(used, found)
         points = zip(self.flat, shapes, strict=True)
         members = [np.zeros(len(profile), bool) if shape is None else shape.members for profile, shape in points]
-        return self._summary(used, found, members)
+        return self._make_mount(used, found, members)
 
     def _require_enough(self, usable: int) -> None:
         if usable < self.shape.fewest_poses:
@@ -325,11 +325,11 @@ class _Calibration:
             raise NoFit(f"no mount fits the profiles: the poses would have errors of {wrong:.3g} mm (rms)") from error
         return weak, advised
 
-    def _summary(self, used: Problem, estimate: RestrictedEstimate[MountState], members: list[np.ndarray]) -> Mount:
+    def _make_mount(self, used: Problem, estimate: RestrictedEstimate[MountState], members: list[np.ndarray]) -> Mount:
         state, scatter = estimate.state, Scatter(*estimate.scatter)
         known = None if self.captured is None else self.captured.known
         covariance, share, factor = mount_covariance(
-            estimate, used.free, state.rotation, known, lambda: self._calibration_derivatives(used, state, members)
+            estimate, used.free, state.rotation, known, lambda: self._find_calibration_derivatives(used, state, members)
         )
         weak, advised = self._require_determined(used, estimate, covariance)
         moved = [used.apply_step(state, step) for step, _ in estimate.without_each]
@@ -374,7 +374,7 @@ class _Calibration:
             inputs=self.evidence.digests,
         )
 
-    def _calibration_derivatives(self, used: Problem, state: MountState, members: list[np.ndarray]) -> np.ndarray:
+    def _find_calibration_derivatives(self, used: Problem, state: MountState, members: list[np.ndarray]) -> np.ndarray:
         """Return derivatives (P, q, Q) of the residuals by the parameters of the sensor's calibration."""
         assert self.captured is not None
         numbers = [n for n in range(len(members)) if n not in self.reasons]
@@ -384,7 +384,7 @@ class _Calibration:
         return used.project(state, used.project_on_lines(np.einsum("ni,niq->nq", used.normals(state), by)))
 
 
-def _sheet_frame(profiles: list[np.ndarray]) -> np.ndarray:
+def _find_sheet_frame(profiles: list[np.ndarray]) -> np.ndarray:
     """Return the frame (4, 4) of the plane of all points, with x and z in it; the identity if y is 0 everywhere."""
     points = np.vstack(profiles)
     if not points[:, 1].any():
@@ -399,7 +399,7 @@ def _sheet_frame(profiles: list[np.ndarray]) -> np.ndarray:
     return rigid_transform(np.column_stack([axes[0], np.cross(axes[1], axes[0]), axes[1]]), middle)
 
 
-def _motion(evidence: MountEvidence) -> Motion:
+def _make_motion(evidence: MountEvidence) -> Motion:
     """Return a function of the time offset that gives the platform's rotations and positions at the profiles."""
     rotations, positions = evidence.poses[:, :3, :3], evidence.poses[:, :3, 3]
     if evidence.pose_times_s is None or evidence.profile_times_s is None:

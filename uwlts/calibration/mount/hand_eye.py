@@ -341,7 +341,7 @@ class BoardEvidence(GroupedEvidence[_State]):
         return np.hstack([shift, Rotation.from_matrix(boards[:, :3, :3] @ common[:3, :3].T).as_rotvec()])
 
     def covariance(self, state: _State) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
-        both, middle = self._by_images(state[0]), state[1][:3] @ np.append(self.middle, 1.0)
+        both, middle = self._differentiate_by_images(state[0]), state[1][:3] @ np.append(self.middle, 1.0)
         # A rotation error of the platform shifts points far from its origin.
         lever = np.tile(np.eye(6, 3, -3), (len(both), 1, 1))
         for axis, unit in enumerate(np.eye(3)):
@@ -360,7 +360,7 @@ class BoardEvidence(GroupedEvidence[_State]):
     def pose_directions(self, state: _State) -> list[np.ndarray]:
         return [np.eye(6)] * len(self.images)
 
-    def _by_images(self, mount: np.ndarray) -> np.ndarray:
+    def _differentiate_by_images(self, mount: np.ndarray) -> np.ndarray:
         """Return derivatives (K, 6, 6) of the residuals by the image errors, which are rotated into the base frame."""
         turn = (self._platforms @ mount @ np.linalg.inv(self.camera_from_sensor))[:, :3, :3]
         both = np.zeros((len(turn), 6, 6))
@@ -369,7 +369,7 @@ class BoardEvidence(GroupedEvidence[_State]):
 
     def residual_derivatives(self, state: _State) -> np.ndarray:
         """Return derivatives (K, 6, Q) of the residuals by the parameters of the sensor's calibration."""
-        return self._by_images(state[0]) @ np.array([image.by_sensor for image in self.images])
+        return self._differentiate_by_images(state[0]) @ np.array([image.by_sensor for image in self.images])
 
     def jacobian(self, state: _State, step: np.ndarray | None = None) -> np.ndarray:
         at, steps = np.zeros(self.size) if step is None else step, np.tile(POSE_STEPS, 2) @ self.free

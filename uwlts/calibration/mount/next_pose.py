@@ -65,7 +65,7 @@ def _generate_candidates(
     nearest = int(np.argmin((every.mean().inv() * every).magnitude()))
     for axis, side in product(range(3), (1, -1)):
         turned = rotations[nearest] @ Rotation.from_rotvec(side * _TURN_RAD * np.eye(3)[axis]).as_matrix()
-        for points, seen, where in _views(problem, state, sheet):
+        for points, seen, where in _list_views(problem, state, sheet):
             platform = state.rotation @ seen + state.translation
             if isinstance(problem.shape, SphereShape):
                 position = (state.artefact[:3] - turned @ platform) / state.scale
@@ -88,7 +88,7 @@ def _generate_candidates(
             yield Candidate(words=text, information=added.information[0], pose=rigid_transform(turned, position))
 
 
-def _views(problem: Problem, state: MountState, sheet: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, str]]:
+def _list_views(problem: Problem, state: MountState, sheet: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, str]]:
     """Return candidate views: points (n, 3) of the artefact and its place (3,), sensor frame, and a description."""
     flat = to_sheet(problem.points, sheet)
     low, high = np.quantile(np.vstack(flat), (0.1, 0.9), axis=0)

@@ -260,7 +260,7 @@ class Problem(GroupedEvidence[MountState]):
 
     def derivatives(self, state: MountState) -> np.ndarray:
         """Return derivatives (N, size) of the distances at a state by the parameters."""
-        return self._derivatives(state) @ self.free
+        return self._compute_derivatives(state) @ self.free
 
     def normals(self, state: MountState) -> np.ndarray:
         """Return derivatives (N, 3) of the distances by the points, along the axes of the sensor."""
@@ -268,7 +268,7 @@ class Problem(GroupedEvidence[MountState]):
         outward = self.shape.normals(state.artefact, self.to_base(state))
         return np.einsum("nij,ni->nj", rotations[self.poses], outward) @ state.rotation
 
-    def _derivatives(self, state: MountState) -> np.ndarray:
+    def _compute_derivatives(self, state: MountState) -> np.ndarray:
         """Return derivatives (N, K) by all values."""
         rotations, positions = self.motion(state.offset_s)
         turned, base = self._all @ state.rotation.T, self.to_base(state)
@@ -376,8 +376,8 @@ class Problem(GroupedEvidence[MountState]):
     def jacobian(self, state: MountState, step: np.ndarray | None = None) -> np.ndarray:
         if step is None:
             return self.project(state, self.derivatives(state))
-        derivatives = self._derivatives(self.apply_step(state, step))
-        derivatives[:, 3:6] = derivatives[:, 3:6] @ _left_jacobian((self.free @ step)[3:6])
+        derivatives = self._compute_derivatives(self.apply_step(state, step))
+        derivatives[:, 3:6] = derivatives[:, 3:6] @ _compute_left_jacobian((self.free @ step)[3:6])
         return self.project(state, derivatives @ self.free)
 
     def covariance(self, state: MountState) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
@@ -431,7 +431,7 @@ def from_sheet(flat: np.ndarray) -> np.ndarray:
     return np.column_stack([flat[:, 0], np.zeros(len(flat)), flat[:, 1]])
 
 
-def _left_jacobian(vector: np.ndarray) -> np.ndarray:
+def _compute_left_jacobian(vector: np.ndarray) -> np.ndarray:
     """Return the derivative of exp(v + dv) exp(-v) by dv, a rotation vector (arXiv:1812.01537, eq. 145)."""
     angle, cross = float(np.linalg.norm(vector)), np.cross(np.eye(3), vector)
     if angle < 1e-6:

@@ -60,8 +60,8 @@ def _start_sphere(problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray, r
     for radius in [problem.shape.radius_mm] if problem.shape.radius_mm else [share * largest for share in _RADII]:
         depth = np.sqrt(np.maximum(radius**2 - radii**2, 0))
         for subset in subsets:
-            for state in _linear_solutions(rotations, positions, centres, depth, subset, radius):
-                found.append((_misfit(rotations, positions, centres, depth, state), state))
+            for state in _solve_linearly(rotations, positions, centres, depth, subset, radius):
+                found.append((_compute_misfit(rotations, positions, centres, depth, state), state))
     found.sort(key=lambda each: each[0])
     return _refine_best(problem, [state for _, state in found[:_TRIED]], sheet)
 
@@ -100,7 +100,7 @@ def _start_on_table(problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray,
     return _refine_best(problem, states, sheet)
 
 
-def _linear_solutions(
+def _solve_linearly(
     rotations: np.ndarray,
     positions: np.ndarray,
     centres: np.ndarray,
@@ -139,7 +139,7 @@ def _rotate_back(rotations: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     return np.einsum("pji,pj->pi", rotations, vectors)
 
 
-def _misfit(
+def _compute_misfit(
     rotations: np.ndarray, positions: np.ndarray, centres: np.ndarray, depth: np.ndarray, state: MountState
 ) -> float:
     """Return the median distance over the poses between the sphere's centre and its position from the profile."""

@@ -50,7 +50,7 @@ class SmoothMap:
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Map points (M, 2); return (M, 2)."""
-        return self.coarsely(points) + _terms(points, self.low, self.high, self.degree) @ self.coefficients
+        return self.coarsely(points) + _compute_terms(points, self.low, self.high, self.degree) @ self.coefficients
 
     def coarsely(self, points: np.ndarray) -> np.ndarray:
         """Map points (M, 2) with the homography only, which extrapolates well."""
@@ -89,12 +89,12 @@ def fit_smooth_map(start: np.ndarray, end: np.ndarray) -> SmoothMap:
     if found is None or not np.isfinite(found).all():
         raise CalibrationError(f"the {len(start)} points of the target determine no homography from image to target")
     low, high = start.min(axis=0), start.max(axis=0)
-    left, terms = end - cv2.perspectiveTransform(start[:, None], found)[:, 0], _terms(start, low, high, degree)
+    left, terms = end - cv2.perspectiveTransform(start[:, None], found)[:, 0], _compute_terms(start, low, high, degree)
     coefficients = np.linalg.lstsq(terms, left, rcond=None)[0]
     return SmoothMap(found, low, high, degree, coefficients, left - terms @ coefficients)
 
 
-def _terms(points: np.ndarray, low: np.ndarray, high: np.ndarray, degree: int) -> np.ndarray:
+def _compute_terms(points: np.ndarray, low: np.ndarray, high: np.ndarray, degree: int) -> np.ndarray:
     """Return products of Legendre polynomials in both coordinates up to a total degree, (M, terms)."""
     x, y = _scale_range(points, low, high).T
     products = legendre.legvander2d(x, y, [degree, degree])
@@ -449,7 +449,7 @@ def fit_polynomials(
     )
     map_rms_mm = float(np.sqrt(np.mean(np.sum(np.concatenate([m.residuals for m in maps]) ** 2, axis=1))))
     used, lines = depth.used, stripes.lines
-    excess, along_excess = _line_excess(depth, lines), _line_excess(along, lines[used])
+    excess, along_excess = _compute_line_excess(depth, lines), _compute_line_excess(along, lines[used])
     poses, stripe_points = np.unique(stripes.pose, return_counts=True)
     figures = {
         "poses": {
@@ -477,7 +477,7 @@ def fit_polynomials(
     return PolynomialResult(calibration, stripes, depth, along, warnings)
 
 
-def _line_excess(fit: LinePolynomials, lines: np.ndarray) -> float:
+def _compute_line_excess(fit: LinePolynomials, lines: np.ndarray) -> float:
     """Return the scatter of the lines' means relative to its expectation by chance, std / sqrt(n)."""
     _, line, count = np.unique(lines[fit.used], return_inverse=True, return_counts=True)
     means, several, rms = np.bincount(line, fit.residuals[fit.used]) / count, count > 1, fit.rms()

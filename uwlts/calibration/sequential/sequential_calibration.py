@@ -166,7 +166,7 @@ def gather(
         )
     sources = sources_of(air, steps)
     found = find_air_evidence(air, stripe=options.stripe, progress=progress)
-    warnings = [*found.warnings, *_window_warnings(air, steps, options)]
+    warnings = [*found.warnings, *_warn_of_window(air, steps, options)]
     on_steps: list[StepEvidence] = []
     if steps:
         on_steps, left_out = step_evidence(
@@ -211,7 +211,7 @@ def solve(evidence: Evidence, *, options: CalibrationOptions) -> CalibrationResu
         unit="mm",
     )
     if lens is not None:
-        sheet, angle = _add_image_uncertainty(sheet, lens, found), _angle_between_halves(sheet, lens, found)
+        sheet, angle = _add_image_uncertainty(sheet, lens, found), _compare_halves(sheet, lens, found)
         figures["camera"] |= _list_lens_figures(lens, found)
         warnings += lens.half_doubts()
         if angle is not None:
@@ -219,7 +219,7 @@ def solve(evidence: Evidence, *, options: CalibrationOptions) -> CalibrationResu
             warnings += half_doubt(text, difference=angle, std=sheet.normal_std_rad)
     figures["sheet"] = sheet.figures(stripe_points, angle)
     warnings += _turn_warnings(camera, sheet, evidence)
-    warnings += _uncertainty_warnings(camera, sheet, sensor)
+    warnings += _warn_of_uncertainty(camera, sheet, sensor)
     calibration = Calibration(
         sensor_name=sensor.name,
         stripe_along=sensor.camera.stripe_along,
@@ -358,7 +358,7 @@ def _find_approach(air: Sequence[Capture]) -> bool:
     return bool(min(along) > 0)
 
 
-def _window_warnings(air: Sequence[Capture], steps: Sequence[Capture], options: CalibrationOptions) -> list[str]:
+def _warn_of_window(air: Sequence[Capture], steps: Sequence[Capture], options: CalibrationOptions) -> list[str]:
     if not all(capture.header.sensor.camera.window.mounted for capture in steps):
         raise CalibrationError("a step capture has no window (window.mounted): its distance cannot be determined")
     if not steps:
@@ -406,7 +406,7 @@ def _estimate_normal(
     return None
 
 
-def _angle_between_halves(sheet: SheetSolution, lens: LensCalibration, found: AirEvidence) -> float | None:
+def _compare_halves(sheet: SheetSolution, lens: LensCalibration, found: AirEvidence) -> float | None:
     """Return the angle between the sheet normals of two halves of the images, each with its own camera."""
     numbers, near = np.arange(len(found.stripes)), np.array(sheet.model.normal)
     one, two = (_estimate_normal(half, numbers[first::2], near, found) for first, half in enumerate(lens.halves))
@@ -449,7 +449,7 @@ def _turn_warnings(camera: CameraSolution, sheet: SheetSolution, evidence: Evide
     return warnings
 
 
-def _uncertainty_warnings(camera: CameraSolution, sheet: SheetSolution, sensor: Sensor) -> list[str]:
+def _warn_of_uncertainty(camera: CameraSolution, sheet: SheetSolution, sensor: Sensor) -> list[str]:
     """Return warnings if sheet or focal length are too uncertain for the described measuring volume.
 
     Let the sheet turn about the middle of the volume. A point at the volume's end then moves along the camera's axis,

@@ -79,10 +79,10 @@ def read_intrinsics(path: Path) -> KnownCamera:
         path, most_bytes=_MOST_BYTES, error=DescriptionError, called="intrinsics", foreign="is not a file of intrinsics"
     )
     # OpenCV's own parser hangs or terminates the process on some damaged files.
-    entries = _xml(text, path) if text.lstrip().startswith("<?xml") else _yaml(text, path)
+    entries = _read_xml(text, path) if text.lstrip().startswith("<?xml") else _read_yaml(text, path)
     equidistant = _is_equidistant(entries, path)
-    known = _unpack_kalibr({_plain_name(key): value for key, value in entries.items()}, path)
-    matrix, coefficients = _numbers(known, _MATRIX, path), _numbers(known, _COEFFICIENTS, path)
+    known = _unpack_kalibr({_simplify_name(key): value for key, value in entries.items()}, path)
+    matrix, coefficients = _list_numbers(known, _MATRIX, path), _list_numbers(known, _COEFFICIENTS, path)
     if matrix.size != 9:
         raise DescriptionError(f"{path}: the camera matrix has {matrix.size} elements; expected 3 x 3")
     fx, skew, cx, _, fy, cy = matrix[:6].tolist()
@@ -90,12 +90,12 @@ def read_intrinsics(path: Path) -> KnownCamera:
         raise DescriptionError(
             f"{path}: the camera matrix is {matrix.tolist()}; expected fx 0 cx, 0 fy cy, 0 0 1 with positive fx, fy"
         )
-    size, offset = _size(known, path), None
-    if region := _region(known, path):
+    size, offset = _read_size(known, path), None
+    if region := _read_region(known, path):
         *offset, width, height = region
         cx, cy, size, offset = cx - offset[0], cy - offset[1], (width, height), (offset[0], offset[1])
     if not equidistant:
-        return KnownCamera(fx, fy, cx, cy, _distortion(coefficients, path), size, offset)
+        return KnownCamera(fx, fy, cx, cy, _make_distortion(coefficients, path), size, offset)
     if len(coefficients) != 4:
         raise DescriptionError(f"{path}: an equidistant lens has 4 coefficients, k1 to k4; found {len(coefficients)}")
     # Without a size, the principal point is taken as the image's centre.
@@ -134,7 +134,7 @@ def set_intrinsics(sensor: Sensor, known: KnownCamera, *, source: str) -> Sensor
     return validate_description(Sensor, merge_tables(sensor.model_dump(), {"camera": changes}), source)
 
 
-def _xml(text: str, path: Path) -> dict[str, object]:
+def _read_xml(text: str, path: Path) -> dict[str, object]:
     """Return the top-level entries of an OpenCV XML file; text becomes a list of words."""
     if "<!" in text.replace("<!--", ""):
         raise DescriptionError(f"{path} declares a type of document or entities, which no file of OpenCV does")
@@ -154,7 +154,7 @@ def _xml(text: str, path: Path) -> dict[str, object]:
         raise DescriptionError(f"{path} is no complete XML: {error}") from error
 
 
-def _yaml(text: str, path: Path) -> dict[str, object]:
+def _read_yaml(text: str, path: Path) -> dict[str, object]:
     """Return the entries of a YAML or JSON file; JSON is YAML except for tabs."""
     if text.startswith("%YAML"):
         # OpenCV writes "%YAML:1.0", which is not valid YAML.
@@ -188,7 +188,7 @@ def _refuse_references(text: str) -> None:
             raise ValueError(f"it is nested more than {MOST_DEPTH} deep")
 
 
-def _plain_name(name: object) -> str:
+def _simplify_name(name: object) -> str:
     """Return the last part of a dotted name in lower case without separators."""
     return re.sub("[^a-z0-9]", "", str(name).rpartition(".")[2].lower())
 
@@ -200,7 +200,7 @@ def _is_equidistant(entries: dict[str, object], path: Path) -> bool:
     """
     stated: dict[bool, str] = {}
     for key, value in _list_values(entries):
-        name, model, entry = _plain_name(key), _plain_name(value), f"{key}: {shorten(str(value))}"
+        name, model, entry = _simplify_name(key), _simplify_name(value), f"{key}: {shorten(str(value))}"
         foreign = model not in (*_BROWN_CONRADY, *_PINHOLES, *_EQUIDISTANT)
         equidistant = name in (*_MODELS, *_MAYBE_MODELS) and model in _EQUIDISTANT
         if name in _MODELS:
@@ -246,8 +246,8 @@ def _unpack_kalibr(known: dict[str, object], path: Path) -> dict[str, object]:
             f"{path} has {len(cameras)} cameras ({shorten(', '.join(cameras))}); expected one: give a file with only "
             "the camera of the sensor"
         )
-    camera = {_plain_name(key): value for key, value in next(iter(cameras.values())).items()}
-    numbers = _numbers(camera, ("intrinsics",), path).tolist()
+    camera = {_simplify_name(key): value for key, value in next(iter(cameras.values())).items()}
+    numbers = _list_numbers(camera, ("intrinsics",), path).tolist()
     if len(numbers) != 4:
         raise DescriptionError(f"{path}: there are {len(numbers)} intrinsics; expected fx, fy, cx, cy of a pinhole")
     fx, fy, cx, cy = numbers
@@ -257,7 +257,7 @@ def _unpack_kalibr(known: dict[str, object], path: Path) -> dict[str, object]:
     return camera
 
 
-def _numbers(known: dict[str, object], names: tuple[str, ...], path: Path) -> np.ndarray:
+def _list_numbers(known: dict[str, object], names: tuple[str, ...], path: Path) -> np.ndarray:
     """Return the finite numbers (N,) of a matrix in any of its notations."""
     value = next((known[name] for name in names if known.get(name) is not None), None)
     value = value.get("data") if isinstance(value, dict) else value
@@ -276,7 +276,7 @@ def _numbers(known: dict[str, object], names: tuple[str, ...], path: Path) -> np
     return numbers
 
 
-def _distortion(coefficients: np.ndarray, path: Path) -> Distortion:
+def _make_distortion(coefficients: np.ndarray, path: Path) -> Distortion:
     """Return k1, k2, p1, p2, k3, k4, k5, k6; further coefficients of OpenCV's longer models must be zero."""
     if len(coefficients) not in (0, 4, 5, 8, 12, 14):
         raise DescriptionError(f"{path}: there are {len(coefficients)} distortion coefficients; expected 4, 5 or 8")
@@ -290,7 +290,7 @@ def _distortion(coefficients: np.ndarray, path: Path) -> Distortion:
     return validate_description(Distortion, known, path)
 
 
-def _size(known: dict[str, object], path: Path) -> tuple[int, int] | None:
+def _read_size(known: dict[str, object], path: Path) -> tuple[int, int] | None:
     sides = ((known.get(f"image{side}"), known.get(side)) for side in ("width", "height"))
     size = [given if given is not None else other for given, other in sides]
     if None in size:
@@ -303,7 +303,7 @@ def _size(known: dict[str, object], path: Path) -> tuple[int, int] | None:
     return width_px, height_px
 
 
-def _region(known: dict[str, object], path: Path) -> list[int]:
+def _read_region(known: dict[str, object], path: Path) -> list[int]:
     """Return column, row, width and height of a CameraInfo's region; empty for the whole image sensor.
 
     Raises DescriptionError if pixels are binned.
@@ -312,7 +312,7 @@ def _region(known: dict[str, object], path: Path) -> list[int]:
         raise DescriptionError(f"{path} is for binned pixels: give the intrinsics of the images that are used")
     roi = known.get("roi")
     names = ("xoffset", "yoffset", "width", "height")
-    stated = {_plain_name(key): value for key, value in roi.items()} if isinstance(roi, dict) else {}
+    stated = {_simplify_name(key): value for key, value in roi.items()} if isinstance(roi, dict) else {}
     try:
         region = [int(str(stated.get(name) or 0)) for name in names]
     except ValueError as error:
@@ -347,7 +347,7 @@ def convert_equidistant(coefficients: np.ndarray, *, corner: float, focal_px: fl
     Raises DescriptionError if the lens does not image the corner, or its angle is too wide for the rational model.
     """
     angle = np.linspace(0.0, _WIDEST, 50 * _SAMPLES)
-    radius = _image_radius(coefficients, angle)
+    radius = _compute_image_radius(coefficients, angle)
     falls = np.flatnonzero(np.diff(radius) <= 0)
     end = falls[0] if len(falls) else len(angle) - 1
     if radius[end] < corner:
@@ -359,7 +359,7 @@ def convert_equidistant(coefficients: np.ndarray, *, corner: float, focal_px: fl
         )
     reach = np.interp(min(_BEYOND * corner, radius[end]), radius[: end + 1], angle[: end + 1])
     angle = np.linspace(0.0, reach, _SAMPLES + 1)[1:]
-    seen, r = _image_radius(coefficients, angle), np.tan(angle)
+    seen, r = _compute_image_radius(coefficients, angle), np.tan(angle)
     powers = np.stack([r**2, r**4, r**6], axis=1)
     below, found = np.ones_like(r), np.zeros(6)
     for _ in range(20):  # passes; the weights settle in less than ten
@@ -383,6 +383,6 @@ def convert_equidistant(coefficients: np.ndarray, *, corner: float, focal_px: fl
     return Distortion(**{f"k{number}": value for number, value in enumerate(found.tolist(), 1)})
 
 
-def _image_radius(coefficients: np.ndarray, angle: np.ndarray) -> np.ndarray:
+def _compute_image_radius(coefficients: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Return the image radius (N,) in focal lengths at angles (N,) to the axis, rad."""
     return angle * (1.0 + sum(k * angle ** (2 * n) for n, k in enumerate(coefficients.tolist(), 1)))

@@ -234,7 +234,7 @@ def _import_folder(
     if images:
         *_, bits = reader.image(images[0].file, laser_on=images[0].light == "laser")
         subtracted = any(row.background is not None for row in frames)
-        zero = _zero_dn(given, bits) if subtracted or reader.derives else 0
+        zero = _find_zero_dn(given, bits) if subtracted or reader.derives else 0
     saturation = 2**bits - 1 if given.saturation_dn is None else given.saturation_dn
     header = capture_header(
         given,
@@ -242,12 +242,12 @@ def _import_folder(
         beside=path.parent,
         name=name,
         saturation_dn=2 * zero - 1 if zero else saturation,
-        remarks=_remarks(given, frames, name, bits=bits, zero_dn=zero),
+        remarks=_list_remarks(given, frames, name, bits=bits, zero_dn=zero),
     )
     saturation = reader.saturation_dn = saturation if given.header is None else header.saturation_dn
     if images and saturation > np.iinfo(reader.dtype).max:
         raise DescriptionError(f"saturation_dn is {saturation}; images of {reader.dtype} have no such value")
-    in_time = _in_order(frames)
+    in_time = _is_in_order(frames)
     content = _Content(header.sensor.camera.stripe_along, saturation, target=header.target is not None)
     held = reader.dtype if images else np.dtype(np.uint8)
     dtype = np.dtype(np.uint16) if zero else held
@@ -301,12 +301,12 @@ def _store_image(
     return unsigned
 
 
-def _in_order(frames: list[ImageRow]) -> bool:
+def _is_in_order(frames: list[ImageRow]) -> bool:
     """Return whether the times of the images do not decrease; an unknown time counts as 0 s."""
     return bool((np.diff(np.nan_to_num([row.time_s for row in frames])) >= 0).all())
 
 
-def _zero_dn(given: ImportDescription, bits: int) -> int:
+def _find_zero_dn(given: ImportDescription, bits: int) -> int:
     """Return the grey value of zero laser light in images that are calculated from others."""
     if given.header is None and bits < 15:
         return 2**bits
@@ -364,7 +364,7 @@ class _Reader:
         return self._kept[1]
 
 
-def _remarks(given: ImportDescription, frames: list[ImageRow], folder: str, *, bits: int, zero_dn: int) -> Table:
+def _list_remarks(given: ImportDescription, frames: list[ImageRow], folder: str, *, bits: int, zero_dn: int) -> Table:
     """Return the provenance of the capture."""
     remarks: Table = {"source": "imported images", "uwlts": __version__, "folder": folder}
     remarks |= {"bits": bits, "stage": stage_remark(given)}
@@ -378,7 +378,7 @@ def _remarks(given: ImportDescription, frames: list[ImageRow], folder: str, *, b
         background = any(row.background is not None for row in frames)
         name, done = ("background", "subtracted from the laser images, ") if background else ("laser_images", "")
         remarks[name] = f"{done}{zero_dn} added"
-    if not _in_order(frames):
+    if not _is_in_order(frames):
         remarks["time"] = "not known of all images in their order, stored as 0"
     for name, values in (("exposure", [row.exposure_ms for row in frames]), ("time", [row.time_s for row in frames])):
         if any(map(math.isnan, values)) and name not in remarks:

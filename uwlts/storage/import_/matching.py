@@ -221,7 +221,7 @@ def planned_frames(given: ImportDescription, matched: Matched, *, in_table: bool
     Each has its position and its light, laser or lamp. Raises DescriptionError if positions are missing, given twice,
     or equal for two images of one light.
     """
-    positions, warnings = _positions(given, {"laser": matched.laser, "lamp": matched.lamp})
+    positions, warnings = _list_positions(given, {"laser": matched.laser, "lamp": matched.lamp})
     lamp_ms = given.exposure_ms if given.lamp_exposure_ms is None else given.lamp_exposure_ms
     frames = []
     for light, rows, usual_ms in (("lamp", matched.lamp, lamp_ms), ("laser", matched.laser, given.exposure_ms)):
@@ -249,7 +249,7 @@ def stage_remark(given: ImportDescription) -> str:
     return "positions as listed"
 
 
-def _positions(
+def _list_positions(
     given: ImportDescription, lights: dict[str, list[ImageRow]]
 ) -> tuple[dict[str, list[float]] | None, list[str]]:
     """Return the positions of the images of each light in their order, None if the table gives them; and warnings."""
@@ -273,7 +273,7 @@ def _positions(
         )
     if stage.free:  # numbered, as they have no positions
         return {light: [float(place) for place in range(len(rows))] for light, rows in lights.items()}, []
-    counts, warnings = _counts(lights)
+    counts, warnings = _count_images(lights)
     if stage.positions_mm is not None:
         if len(stage.positions_mm) != count:
             raise DescriptionError(
@@ -285,7 +285,7 @@ def _positions(
     return {light: [start_mm + place * step_mm for place in each] for light, each in counts.items()}, warnings
 
 
-def _counts(lights: dict[str, list[ImageRow]]) -> tuple[dict[str, list[int]], list[str]]:
+def _count_images(lights: dict[str, list[ImageRow]]) -> tuple[dict[str, list[int]], list[str]]:
     """Return the number of each image from that of the first one, by the names of the files; and warnings of gaps.
 
     Both lights have the same first image if they have numbers in common.

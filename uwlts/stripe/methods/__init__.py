@@ -35,12 +35,12 @@ def place_centre(method: str, peak: PeakWindow) -> tuple[np.ndarray, np.ndarray]
         return np.empty(0, np.float32), np.empty(0, np.float32)
     centre = import_module(f"{__name__}.{method.replace('-', '_')}").centres(peak)
     heights = np.empty(centre.size, np.float32)
-    _best_heights(peak, centre, heights)
+    _find_best_heights(peak, centre, heights)
     return centre, heights
 
 
 @compiled
-def _best_heights(peak: PeakWindow, centre: np.ndarray, result: np.ndarray) -> None:
+def _find_best_heights(peak: PeakWindow, centre: np.ndarray, result: np.ndarray) -> None:
     for m in range(centre.size):
         sigma = max(peak.sigma[m], np.float32(_ONE_PIXEL))
         total, _, _, width = gaussian_moments(peak, m, centre[m])

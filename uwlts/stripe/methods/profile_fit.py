@@ -386,7 +386,7 @@ def _measure_scatters(some: PeakWindow, centre: np.ndarray, rows: np.ndarray, *o
     ``some`` are the peaks of the lines ``rows`` (R, K) of R runs. The distances are NaN if too few lines belong to a
     smooth stripe.
     """
-    weights, jump = _residual_weights(_Comparison.reach), _Comparison.jump * some.window.shape[1]
+    weights, jump = _compute_residual_weights(_Comparison.reach), _Comparison.jump * some.window.shape[1]
     scatters = []
     for values in (centre[rows.ravel()], *(other.centres(some) for other in others)):
         total, count = _sum_squares((some.start, some.middle, values), rows.shape[1], weights, jump)
@@ -434,7 +434,7 @@ def _select_runs(count: int) -> np.ndarray:
 
 
 @lru_cache
-def _residual_weights(reach: int) -> np.ndarray:
+def _compute_residual_weights(reach: int) -> np.ndarray:
     """Return weights (2 R + 1,) of centres that give the middle one's distance from their least-squares parabola."""
     powers = np.vander(np.arange(-reach, reach + 1, dtype=float), 3)
     weights = -np.linalg.pinv(powers)[-1]

@@ -106,7 +106,7 @@ def find_blobs(image, noise):
     ``noise`` is the standard deviation of a pixel of the image (H, W). The first family may be empty.
     """
     best, best_score = Blobs(np.empty((0, 2)), np.empty((0, 2, 2)), True), (0, 0.0)
-    for bright, mask in _local_masks(image, noise):
+    for bright, mask in _make_local_masks(image, noise):
         blobs = _select_ellipses(mask, bright=bright, fewest=best_score[0])
         radii = blobs.radii
         first, last = _find_family(radii, 2.0)
@@ -115,7 +115,7 @@ def find_blobs(image, noise):
             best, best_score = blobs, score
     yield best
     families = []
-    for bright, mask in _local_masks(image, noise):
+    for bright, mask in _make_local_masks(image, noise):
         blobs = _select_ellipses(mask, bright=bright)
         blobs = blobs[np.argsort(blobs.radii)]
         while len(blobs) >= _Rule.fewest:
@@ -125,7 +125,7 @@ def find_blobs(image, noise):
     yield from sorted(families, key=len, reverse=True)[: _Rule.most_families]
 
 
-def _local_masks(image, noise):
+def _make_local_masks(image, noise):
     """Yield the polarity (True: bright) and mask (H, W) of pixels beyond each window's local threshold.
 
     A mask is valid until the next one is asked for.
@@ -251,7 +251,7 @@ def _select_ellipses(mask, *, bright, fewest=0):
         return Blobs(np.empty((0, 2)), np.empty((0, 2, 2)), bright)
     points = np.concatenate([contours[k] for k in chosen])[:, 0]
     first = np.cumsum(lengths[chosen]) - lengths[chosen]
-    area, centres, covariances = _outline_moments(points, first)
+    area, centres, covariances = _compute_outline_moments(points, first)
     inside = np.logical_and.reduceat(((points > 1) & (points < (width - 2, height - 2))).all(1), first)
     # The outline passes through pixel centres: it excludes half a pixel all around, and lines of pixels completely.
     inside &= (area > 0) & (area + lengths[chosen] / 2 >= _Rule.least_area_px)
@@ -265,7 +265,7 @@ def _select_ellipses(mask, *, bright, fewest=0):
     return Blobs(centres[inside][like], (vectors * semi_axes[:, None, :]) @ vectors.swapaxes(1, 2), bright)
 
 
-def _outline_moments(points, first):
+def _compute_outline_moments(points, first):
     """Return areas (K,), centroids (K, 2) and covariances xx, xy, yx, yy (K, 4) of polygons, by Green's theorem.
 
     ``points`` (N, 2) contains the polygons one after another, from the indices ``first`` (K,) on. Lines have area 0.

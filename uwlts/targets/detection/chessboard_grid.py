@@ -87,7 +87,7 @@ def _measure_unevenness(board: np.ndarray) -> float | None:
     for top, left in product(*starts):
         part = board[top : top + size, left : left + size]
         j, i = np.nonzero(np.isfinite(part[..., 0]))
-        sides = _side_lengths(part)
+        sides = _measure_sides(part)
         if min(len(set(i)), len(set(j))) < 2 or len(i) < 6 or not len(sides):
             continue
         flat, pixels = np.stack([i, j], axis=1).astype(np.float64), part[j, i]
@@ -156,7 +156,7 @@ def refine_corners(image: np.ndarray, grid: np.ndarray) -> np.ndarray:
     Grey levels are clipped near the middle between dark and bright, so that only the edges of the squares count, not
     lighting and noise inside them. Corners that leave their window, or are not between four squares, become NaN.
     """
-    found, sides = np.full_like(grid, np.nan), _side_lengths(grid)
+    found, sides = np.full_like(grid, np.nan), _measure_sides(grid)
     if not len(sides):
         return found
     most = int(np.clip(_Rule.window * _Rule.reaches[0] * sides.min(), _Rule.least_window_px, _Rule.most_window_px))
@@ -180,7 +180,7 @@ def refine_corners(image: np.ndarray, grid: np.ndarray) -> np.ndarray:
     return remove_doubtful(smooth[rim:-rim, rim:-rim], found)
 
 
-def _side_lengths(grid: np.ndarray) -> np.ndarray:
+def _measure_sides(grid: np.ndarray) -> np.ndarray:
     """Return the lengths (N,) in px of all sides of squares with two known corners."""
     lengths = np.concatenate([np.linalg.norm(np.diff(grid, axis=axis), axis=2).ravel() for axis in (0, 1)])
     return lengths[np.isfinite(lengths)]
@@ -198,7 +198,7 @@ def _compare_squares(grey: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np
     zero if opposite squares differ at every reach, as at a board's outline or below a stripe, and if squares are
     unknown. The reach is the first one where opposite squares are equal.
     """
-    down, right = (_steps(grid, axis) for axis in (0, 1))
+    down, right = (_measure_steps(grid, axis) for axis in (0, 1))
     levels, contrast = np.full((4, *grid.shape[:2]), np.nan), np.zeros(grid.shape[:2])
     reaches = np.full(grid.shape[:2], _Rule.reaches[0])
     known = np.isfinite(grid + down + right).all(axis=2)
@@ -215,7 +215,7 @@ def _compare_squares(grey: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np
     return levels, contrast, reaches
 
 
-def _steps(grid: np.ndarray, axis: int) -> np.ndarray:
+def _measure_steps(grid: np.ndarray, axis: int) -> np.ndarray:
     """Return steps (J, I, 2) between corners along an axis: the mean of both sides, or the known one."""
     ways = np.diff(grid, axis=axis)
     none = np.full_like(np.take(grid, [0], axis=axis), np.nan)

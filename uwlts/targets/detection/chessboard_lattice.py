@@ -63,8 +63,8 @@ class _Corners:
         rim = int(_Rule.ring_px) + 2
         highest[:rim], highest[-rim:], highest[:, :rim], highest[:, -rim:] = False, False, False, False
         pixels = np.argwhere(highest)[:, ::-1].astype(np.float64)
-        outer = _harmonics(grey, pixels, _Rule.ring_px)
-        inner = _harmonics(grey, pixels, _Rule.inner_ring * _Rule.ring_px)
+        outer = _compute_harmonics(grey, pixels, _Rule.ring_px)
+        inner = _compute_harmonics(grey, pixels, _Rule.inner_ring * _Rule.ring_px)
         power = np.abs(outer[:, 1:]) ** 2
         share = power[:, 1] / np.maximum(power.sum(axis=1), 1e-9)
         in_phase = np.cos(np.angle(outer[:, 2]) - np.angle(inner[:, 2]))
@@ -222,7 +222,7 @@ def _is_side(last: np.ndarray, before: np.ndarray, shape: tuple[int, ...]) -> bo
     return bool(np.count_nonzero(inside.all(axis=1)) > 1)
 
 
-def _harmonics(grey: np.ndarray, pixels: np.ndarray, radius: float) -> np.ndarray:
+def _compute_harmonics(grey: np.ndarray, pixels: np.ndarray, radius: float) -> np.ndarray:
     """Return Fourier coefficients (N, K) of the grey levels on circles around pixels (N, 2)."""
     count = _Rule.ring_places
     angle = 2.0 * np.pi / count * np.arange(count)

@@ -80,7 +80,7 @@ def find_centroids(grey, ellipses):
     the ellipse's centre is returned. ``grey`` is the image (H, W).
     """
     centres, agree = ellipses.centres, np.ones(len(ellipses), bool)
-    reaches = _band_reaches(grey.shape, ellipses)
+    reaches = _find_band_reaches(grey.shape, ellipses)
     for _ in range(RULE.passes):
         planes = _level_planes(grey, centres, ellipses.shapes, reaches)
         moved = _compute_centroids(grey, centres, ellipses.shapes, reaches, planes)
@@ -89,7 +89,7 @@ def find_centroids(grey, ellipses):
     return centres, agree
 
 
-def _band_reaches(shape, ellipses):
+def _find_band_reaches(shape, ellipses):
     """Return the reach of the band inwards and outwards from each ellipse, two arrays (N,), px."""
     semi_axes = np.linalg.eigvalsh(ellipses.shapes)
     wanted = np.clip(
@@ -156,8 +156,8 @@ def _sum_shares(grey, centres, inner, outer, planes, result):
         top, bottom = math.ceil(centre_v - half_height), math.floor(centre_v + half_height)
         for v in range(max(top, 0), min(bottom + 1, height)):
             dv = v - centre_v
-            first, last = _row_extent(q, centre_u, dv)
-            whole_from, whole_to = _row_extent(inner[n], centre_u, dv)
+            first, last = _find_row_extent(q, centre_u, dv)
+            whole_from, whole_to = _find_row_extent(inner[n], centre_u, dv)
             first, last = max(first, 0), min(last, width - 1)
             whole_from, whole_to = max(whole_from, first), min(whole_to, last)
             if whole_from > whole_to:
@@ -177,7 +177,7 @@ def _sum_shares(grey, centres, inner, outer, planes, result):
 
 
 @compiled_part
-def _row_extent(q, centre_u, dv):
+def _find_row_extent(q, centre_u, dv):
     """Return first and last u within an ellipse in a row; first > last if the row does not meet the ellipse."""
     mixed = q[0, 1] * dv
     root = mixed * mixed - q[0, 0] * (q[1, 1] * dv * dv - 1.0)
@@ -415,10 +415,10 @@ def circle_centre_bias(project, centres_mm, *, diameter_mm):
             f"{broken.sum()} of {len(centres)} circles cannot be projected, the first at {centres[broken][0]} mm; "
             "remove circles that the camera cannot see"
         )
-    return _ellipse_centres(pixels[:, 1:]) - pixels[:, 0]
+    return _fit_centres(pixels[:, 1:]) - pixels[:, 0]
 
 
-def _ellipse_centres(points):
+def _fit_centres(points):
     """Return the centres (N, 2) of the conics that best fit N sets of points (N, M, 2), M >= 6."""
     middle = points.mean(1, keepdims=True)
     scale = np.sqrt(((points - middle) ** 2).mean((1, 2), keepdims=True))

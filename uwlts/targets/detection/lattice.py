@@ -70,7 +70,7 @@ def select_agreeing(points, indices):
         if alone.any():
             valid &= ~alone
             continue
-        excess = _relative_errors(points, around, present, terms, valid)
+        excess = _compute_relative_errors(points, around, present, terms, valid)
         wrong = valid & (excess > 1) & (excess >= np.where(present, excess[around], 0.0).max(1))
         if not wrong.any():
             break
@@ -78,7 +78,7 @@ def select_agreeing(points, indices):
     return np.flatnonzero(valid)
 
 
-def _relative_errors(points, around, present, terms, valid):
+def _compute_relative_errors(points, around, present, terms, valid):
     """Return each point's distance from its prediction, divided by the allowed one; zero without a prediction."""
     weight = present.astype(float)
     normal = np.einsum("np,pa,pb->nab", weight, terms, terms)
@@ -229,7 +229,7 @@ def grow_lattice(seed, basis, points, tree, *, nearest, may_be_neighbours):
     while frontier:
         asked, expected, lengths = [], [], []
         for point in frontier:
-            steps[point] = _local_steps(where[point], places, at, steps[point])
+            steps[point] = _find_local_steps(where[point], places, at, steps[point])
             i, j = where[point]
             for di, dj in ((1, 0), (-1, 0), (0, 1), (0, -1)):
                 if (place := (i + reach * di, j + reach * dj)) not in places:
@@ -253,7 +253,7 @@ def grow_lattice(seed, basis, points, tree, *, nearest, may_be_neighbours):
     return places
 
 
-def _local_steps(place, places, points, inherited):
+def _find_local_steps(place, places, points, inherited):
     """Return the steps along i and j at a place: the mean over both neighbours, one neighbour, or as inherited."""
     i, j = place
     here = points[places[place]]

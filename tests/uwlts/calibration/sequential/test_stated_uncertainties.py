@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from uwlts.calibration.sequential.sequential_calibration import _uncertainty_warnings
+from uwlts.calibration.sequential.sequential_calibration import _warn_of_uncertainty
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.report.file_description import calibration_lines
 
@@ -16,7 +16,7 @@ def warnings_for(sensor, *, normal_deg, focal_share):
         normal_std_rad=np.radians(normal_deg), model=SimpleNamespace(normal=(0.0, -np.cos(angle), np.sin(angle)))
     )
     camera = SimpleNamespace(std=lambda: {"f": 2000.0 * focal_share, "cx": 3.0}, values=lambda: {"f": 2000.0})
-    return _uncertainty_warnings(camera, sheet, sensor)
+    return _warn_of_uncertainty(camera, sheet, sensor)
 
 
 def test_a_sheet_of_uncertain_direction_is_said_in_mm_of_depth(thesis):
