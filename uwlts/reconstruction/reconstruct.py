@@ -320,7 +320,7 @@ def _doubt_images(stripes: CaptureStripes, *, by_stage: bool) -> list[str]:
     strange = by_stage & (beside > max(_BESIDE_NOISE * noise, (usual * _BESIDE_OTHERS).min()))
     doubts = (
         (repeated, repeated, "is exactly that in the image before", "a repeated image, or images without noise"),
-        (strange, beside, "is not between those of its neighbours", "images were exchanged, or are of another scan"),
+        (strange, beside, "is not between those of its neighbours", "exchanged images, some of another scan, or ribs"),
     )
     return [
         f"the stripe in {np.count_nonzero(found)} of {len(frames)} images {what}, such as in image "
