@@ -11,6 +11,7 @@ import pytest
 from cyclopts import App
 
 from tests.system.in_process import run_program, uwlts
+from tests.uwlts.desk.test_scan_service import write_images
 from twin.cli import app as twin_app
 from uwlts.argument_types import OUTPUTS
 from uwlts.cli import app as uwlts_app
@@ -160,7 +161,8 @@ def test_an_ending_that_names_no_format_is_refused_before_the_work(program, comm
         assert list(tmp_path.iterdir()) == []
 
 
-def test_a_capture_is_not_exported_under_the_name_of_a_cloud(tmp_path):
+def test_a_capture_is_not_exported_under_the_name_of_a_cloud(tmp_path, thesis):
+    write_images(tmp_path / "scan.h5", thesis, (True,))
     ended = uwlts("export", tmp_path / "scan.h5", "--out", tmp_path / "scan.laz")
     assert ended.returncode == 2
     assert "is a capture" in ended.stderr
