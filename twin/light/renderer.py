@@ -416,9 +416,8 @@ class Renderer:
         fewer = max(spp // _FEWER_SAMPLES, min(spp, _LEAST_SPP))
         for where, count in ((steep, spp), (changes & ~steep, fewer)):
             for rows, columns in split_pixels(*find_marked(where), spp=count):
-                image[rows, columns] = self._pixels.render(evenly_lit, pose, rows, columns, spp=count, shifted=True)()[
-                    0
-                ]
+                means = self._pixels.render(evenly_lit, pose, rows, columns, spp=count, shifted=True)
+                image[rows, columns] = means()[0]
         return image
 
     def laser_frame(

@@ -73,9 +73,8 @@ class Sheet:
     ``power_w`` is the power behind the window, before absorption. ``begins_at_z_mm`` is the smallest Z of the window's
     outer face in the OCS, before which there is no light. ``parts`` are the Gaussians across the sheet, the main one
     first. Side lobes make the lit surface ``reach`` times as wide, those that are not faint ``bright_reach`` times. The
-    sheet of another laser has its own OCS;
-    ``sheet_from_object`` (4, 4) transforms from the sensor's OCS to it. DesignError if part of the fan does not pass
-    the window, or the window bends the fan too unevenly.
+    sheet of another laser has its own OCS; ``sheet_from_object`` (4, 4) transforms from the sensor's OCS to it.
+    DesignError if part of the fan does not pass the window, or the window bends the fan too unevenly.
     """
 
     def __init__(self, sensor: Sensor, medium: Medium, laser: Laser | None = None):

@@ -69,7 +69,7 @@ class DriftModel:
             by_rates = t * u
         else:
             # A stationary rate has stationary increments, whose variance determines the covariance.
-            of_t, of_u, of_both, of_end = map(self._find_increment, (t, u, np.abs(t - u), 1.0))
+            of_t, of_u, of_both, of_end = map(self._integrate_rate, (t, u, np.abs(t - u), 1.0))
             by_rates = (of_t + of_u - of_both) / (2 * of_end)
         return variance * ((1 - walk) * by_rates + walk * np.minimum(t, u))
 
@@ -80,10 +80,10 @@ class DriftModel:
         """
         by_rates, by_walk = 0.0, step / 4
         if np.isfinite(self.correlation):
-            by_rates = (self._find_increment(step / 2) - self._find_increment(step) / 4) / self._find_increment(1.0)
+            by_rates = (self._integrate_rate(step / 2) - self._integrate_rate(step) / 4) / self._integrate_rate(1.0)
         return self.std * np.sqrt(np.maximum((1 - self.walk) * by_rates + self.walk * by_walk, 0.0))
 
-    def _find_increment(self, t: np.ndarray | float) -> np.ndarray:
+    def _integrate_rate(self, t: np.ndarray | float) -> np.ndarray:
         """Return the variance of the integral over a time t of a rate with the correlation exp(-a).
 
         A smooth rate has the correlation (1 + a) exp(-a) (Matern: Rasmussen and Williams, Gaussian Processes for

@@ -357,9 +357,9 @@ class ScanService:
                 report=self._report, warn=self._warn, between=self._end_if_stopped, recorded=shown.put
             )
             seen = record_scan(plan, out, camera=devices.camera, stage=stage, listeners=listeners)
-        if seen.warnings():
+        if warnings := seen.warnings():
             self.state.level = "warning"
-        written = "; ".join([f"wrote {out}", *seen.warnings()])
+        written = "; ".join([f"wrote {out}", *warnings])
         if self._advice is not None:
             self._report(written)
             self._advice.add(out, pose, lambda done, total, stage="": self._end_if_stopped())
@@ -410,6 +410,8 @@ class ScanService:
 
 _STATE_S = 1.0  # between two messages of diagnostics, which ROS's aggregator calls stale after 5 s
 _QUEUED = 100  # messages that a slow subscriber may be behind: 10 s of a camera with 10 images a second
+_MODULES = ("rclpy", "rclpy.executors", "sensor_msgs.msg", "std_msgs.msg", "builtin_interfaces.msg", "std_srvs.srv")
+_MODULES += ("geometry_msgs.msg", "diagnostic_msgs.msg", "rcl_interfaces.msg")
 _WHEELS = ("ros-rclpy", "ros-rmw-fastrtps-cpp", "ros-sensor-msgs", "ros-std-srvs", "ros-diagnostic-msgs")
 """Wheels with ROS 2 for Python on Linux, from PyPI."""
 
@@ -573,19 +575,9 @@ def _answer(work: Callable[[], str]) -> Callable[[Any, Any], Any]:
 
 
 def _import_ros() -> tuple[Any, ...]:
-    """Return rclpy, its executors, and the modules of the messages and of the service."""
+    """Import `_MODULES`: rclpy, its executors, and messages and services."""
     try:
-        return (
-            import_module("rclpy"),
-            import_module("rclpy.executors"),
-            import_module("sensor_msgs.msg"),
-            import_module("std_msgs.msg"),
-            import_module("builtin_interfaces.msg"),
-            import_module("std_srvs.srv"),
-            import_module("geometry_msgs.msg"),
-            import_module("diagnostic_msgs.msg"),
-            import_module("rcl_interfaces.msg"),
-        )
+        return tuple(map(import_module, _MODULES))
     except ImportError as error:
         raise SetupError(
             f"uwlts ros needs ROS 2 for Python, which cannot be imported ({error}): source an installation for "

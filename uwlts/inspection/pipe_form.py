@@ -161,7 +161,7 @@ def _fit_from(
         near = np.abs(off - np.median(off)) < FORM_RULE.off_pipe * radius
         arc = _measure_arc(angle[near])
         terms = _list_terms(arc)
-        design = _find_design(along, angle, scale, terms)
+        design = _make_design(along, angle, scale, terms)
         rows, weight = fit_biweight(design, off, near)
         coefficients = rows @ off
         known = dict(zip(terms, coefficients, strict=True))
@@ -232,7 +232,7 @@ def pipe_features(
                 f"{np.degrees(arc):.0f} deg; {FORM_RULE.section_points} over {np.degrees(least):.0f} deg are needed"
             )
             continue
-        design = _find_design(np.zeros(len(members)), form.angle[members], 1.0, terms)
+        design = _make_design(np.zeros(len(members)), form.angle[members], 1.0, terms)
         weights = np.linalg.pinv(design, rcond=1e-6)
         coefficients = weights @ raw[members]
         middle = form.frame.point_mm + 0.5 * (start + end) * form.frame.axes[2]
@@ -316,7 +316,7 @@ def _measure_arc_diameter(
     """
     moved = [form.terms.index(term) for term in ("cos", "sin", "along cos", "along sin")]
     members = form.used[inside]
-    by_axis = weights @ _find_design(form.along_mm[members], form.angle[members], form.scale_mm, form.terms)[:, moved]
+    by_axis = weights @ _make_design(form.along_mm[members], form.angle[members], form.scale_mm, form.terms)[:, moved]
     whole = -by_axis @ form.weights[moved]
     whole[inside] += weights
     random, common = errors.covariances(whole[None], form.distance_mm[form.used], _neighbourhoods(form, form.used))
@@ -355,7 +355,7 @@ def _list_terms(arc: float) -> tuple[str, ...]:
     return tuple(terms)
 
 
-def _find_design(along_mm: np.ndarray, angle: np.ndarray, scale: float, terms: tuple[str, ...]) -> np.ndarray:
+def _make_design(along_mm: np.ndarray, angle: np.ndarray, scale: float, terms: tuple[str, ...]) -> np.ndarray:
     """Return the derivatives (N, K) of the radial distance by the coefficients of the terms."""
     t = np.asarray(along_mm) / scale
     columns = []
@@ -379,7 +379,7 @@ def _evaluate_terms(
 ) -> np.ndarray:
     """Return the sum (N,) of the terms of the radial distance; derivatives would need 112 bytes a point."""
     parts = [slice(start, start + _AT_A_TIME) for start in range(0, len(along_mm), _AT_A_TIME)]
-    sums = [_find_design(along_mm[part], angle[part], scale, terms) @ coefficients for part in parts]
+    sums = [_make_design(along_mm[part], angle[part], scale, terms) @ coefficients for part in parts]
     return np.concatenate([np.zeros(0), *sums])
 
 

@@ -49,9 +49,9 @@ _KEPT_IMAGES = 3000
 _BESIDE_NOISE, _BESIDE_OTHERS, _USUAL = 2.0, (5.0, 20.0), (0.9, 0.75)
 """Strange distance of a stripe from where its neighbours let expect it, in standard deviations of centres, and in the
 largest of the usual fractions of images. Chosen on ten scans of thesis-small, at most 0.4 of the noise, and on
-exchanged images of spheres, from 2.4. Of 300 drawn surfaces that are rough along the stage alone, 5 are reported. A
-fifth of the images from another scan is reported for 73 to 100 % of the drawn surfaces. Without the second fraction, it
-is for 0 to 35 %. The second one reports 6 to 9 % more of the surfaces with waves or ribs along the stage alone."""
+exchanged images of spheres, from 2.4. Of 300 drawn surfaces that are rough along the stage alone, 5 are reported. The
+second pair notices a fifth of the images from another scan on 73 to 100 % of drawn surfaces, the first one on 0 to
+35 %. It also reports 6 to 9 % of the surfaces that have waves or ribs along the stage alone."""
 
 
 def reconstruct(

@@ -101,9 +101,9 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         except CaptureError as error:
             raise CaptureError(f"cannot resume: {error}; give `overwrite` to start again") from error
         held = unfinished.header, unfinished.dtype, unfinished.plan()
-        there = _list_recording(*held, lines=unfinished.holds_lines, moving=unfinished.moving)
+        there = _dump_recording(*held, lines=unfinished.holds_lines, moving=unfinished.moving)
         kinds = {"lines": bool(self._lines), "moving": self._moving}
-        wanted = _list_recording(self.header, self._dtype, self._plan, **kinds)
+        wanted = _dump_recording(self.header, self._dtype, self._plan, **kinds)
         if others := describe_differences(there, wanted):
             unfinished.close()
             raise CaptureError(
@@ -278,7 +278,7 @@ def _lock(part: Path) -> BufferedReader:
     return file
 
 
-def _list_recording(header: CaptureHeader, dtype: np.dtype, plan: Table | None, *, lines: bool, moving: bool) -> Table:
+def _dump_recording(header: CaptureHeader, dtype: np.dtype, plan: Table | None, *, lines: bool, moving: bool) -> Table:
     """Return a description of a recording as JSON."""
     held = f"{dtype}{' and centre lines' if lines else ''}{', moving' if moving else ''}"
     return {"plan": plan, "images": held, "header": header.model_dump(mode="json")}

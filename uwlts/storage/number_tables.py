@@ -26,10 +26,10 @@ _LENGTHS |= {"in": 25.4, "ft": 304.8, "yd": 914.4}
 _ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "gon": np.pi / 200}
 _TIMES = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 _SAME_UNITS = {"degree": "deg", "°": "deg", "radian": "rad", "grad": "gon", "second": "s", "micron": "um"}
-_SAME_UNITS |= {'"': "in", "inch": "in", "inche": "in", "foot": "ft", "feet": "ft"}
+_SAME_UNITS |= {'"': "in", "inch": "in", "inches": "in", "foot": "ft", "feet": "ft"}
 _PREFIXES = {"": "m", "milli": "mm", "centi": "cm", "micro": "um", "kilo": "km"}
 _SAME_UNITS |= {f"{prefix}met{end}": unit for prefix, unit in _PREFIXES.items() for end in ("re", "er")}
-"""Units by their names in the singular."""
+"""Units by their names, which may have a plural with s."""
 _UNITS = _LENGTHS | _ANGLES | _TIMES
 _DIRECTIONS = {"east": (1, 0, 0), "north": (0, 1, 0), "up": (0, 0, 1)}
 _DIRECTIONS |= {"west": (-1, 0, 0), "south": (0, -1, 0), "down": (0, 0, -1)}
@@ -412,7 +412,8 @@ def _split_unit(cell: str) -> tuple[str, str | None]:
 
 def _simplify_unit(unit: str) -> str:
     unit = unit.strip().replace("µ", "u").replace("μ", "u")
-    return _SAME_UNITS.get(unit.removesuffix("s") if len(unit) > len("sec") else unit, unit)
+    singular = unit.removesuffix("s") if len(unit) > len("sec") else unit
+    return _SAME_UNITS.get(unit) or _SAME_UNITS.get(singular, unit)
 
 
 def _normalise_name(name: str) -> str:

@@ -57,19 +57,26 @@ def count_names(names: Sequence[str], *, series: bool = False) -> Counted | None
         return min(known, key=lambda each: each.places()[-1])
     alone = len(varying) < 2
     for column in varying or columns[:1]:
-        falls = [place for place, (one, two) in enumerate(pairwise(column)) if one > two or (alone and one == two)]
-        place = falls[0] if falls else 0
-        # Counts of several scans return to 0 or 1; so do seconds and minutes of times, but after 59.
-        again = not alone and not series and column[0] < 2 and all(column[each + 1] == column[0] for each in falls)
-        in_time = column[place] < 60 <= 2 * column[place] - column[place - 1] + 1
-        if falls and (alone or (again and not in_time)):
-            same = column[place] == column[place + 1]
-            problem = "have the same number: remove one" if same else "are in the reverse order of their numbers"
-            problem = "are the last and first of two scans: narrow the patterns" if again else problem
-            raise DescriptionError(
-                f"{names[place]} and {names[place + 1]} {problem}, or give a table with a column stage_mm"
-            )
+        if alone or not series:
+            _check_order(names, column, alone=alone)
     return None
+
+
+def _check_order(names: Sequence[str], numbers: list[int], *, alone: bool) -> None:
+    """Raise DescriptionError for the only numbers that vary if they do not increase, else if a second scan follows."""
+    falls = [place for place, (one, two) in enumerate(pairwise(numbers)) if one > two or (alone and one == two)]
+    if not falls:
+        return
+    place = falls[0]
+    last, following = numbers[place : place + 2]
+    problem = "have the same number: remove one" if last == following else "are in the reverse order of their numbers"
+    if not alone:
+        # Counts of several scans return to 0 or 1; so do seconds and minutes of times, but after 59.
+        in_time = last < 60 <= 2 * last - numbers[place - 1] + 1
+        if in_time or numbers[0] > 1 or any(numbers[each + 1] != numbers[0] for each in falls):
+            return
+        problem = "are the last and first of two scans: narrow the patterns"
+    raise DescriptionError(f"{names[place]} and {names[place + 1]} {problem}, or give a table with a column stage_mm")
 
 
 def _count(numbers: np.ndarray) -> Counted | None:

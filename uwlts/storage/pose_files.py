@@ -73,7 +73,7 @@ def read_poses(
         Names or their units contradict the format or ``unit``, or the number of columns is wrong. Numbers are not
         finite, matrices not rigid, quaternions not of unit length, or angles in rad look like degrees.
     """
-    return _find_poses(read_number_table(Path(path), named=False), pose_format, unit)
+    return _make_poses(read_number_table(Path(path), named=False), pose_format, unit)
 
 
 def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", unit: Unit | None = None) -> Trajectory:
@@ -105,7 +105,7 @@ def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", uni
             table = replace(table, columns=dict(zip(names, table.columns.values(), strict=True)))
         pose_format, unit = "quaternion-xyzw", "m"
     covariance = _take_covariances(table.columns, path, table.mm_per_unit(unit=unit))
-    poses, times = _find_poses(table, pose_format, unit)
+    poses, times = _make_poses(table, pose_format, unit)
     if times is None:
         raise DescriptionError(f"{path} has no column time_s: a trajectory needs the time of each pose")
     if "time_s" not in table.units and np.abs(times).max(initial=0) > _LATEST_S:
@@ -200,7 +200,7 @@ def _find_alternation(poses: np.ndarray) -> list[str]:
     ]
 
 
-def _find_poses(table: NumberTable, pose_format: PoseFormat, unit: Unit | None) -> tuple[np.ndarray, np.ndarray | None]:
+def _make_poses(table: NumberTable, pose_format: PoseFormat, unit: Unit | None) -> tuple[np.ndarray, np.ndarray | None]:
     """Return the poses (P, 4, 4) in mm of a table, and their times (P,) or None."""
     path = table.path
     columns = {name: values for name, values in table.columns.items() if name not in COVARIANCE_COLUMNS}

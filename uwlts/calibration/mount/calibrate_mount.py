@@ -329,7 +329,7 @@ class _Calibration:
         state, scatter = estimate.state, Scatter(*estimate.scatter)
         known = None if self.captured is None else self.captured.known
         covariance, share, factor = mount_covariance(
-            estimate, used.free, state.rotation, known, lambda: self._find_calibration_derivatives(used, state, members)
+            estimate, used.free, state.rotation, known, lambda: self._differentiate_by_calibration(used, state, members)
         )
         weak, advised = self._require_determined(used, estimate, covariance)
         moved = [used.apply_step(state, step) for step, _ in estimate.without_each]
@@ -374,7 +374,7 @@ class _Calibration:
             inputs=self.evidence.digests,
         )
 
-    def _find_calibration_derivatives(self, used: Problem, state: MountState, members: list[np.ndarray]) -> np.ndarray:
+    def _differentiate_by_calibration(self, used: Problem, state: MountState, members: list[np.ndarray]) -> np.ndarray:
         """Return derivatives (P, q, Q) of the residuals by the parameters of the sensor's calibration."""
         assert self.captured is not None
         numbers = [n for n in range(len(members)) if n not in self.reasons]
