@@ -1,7 +1,7 @@
 """Probability of detection of pits, dents and undercuts in rendered campaigns, after MIL-HDBK-1823A (2009).
 
 A search reports only what it finds: its hits and misses are a logistic function of the logarithm of the depth, and the
-bound is that of the likelihood ratio (appendix G.3). Undercuts are measured on every weld: their signals are a linear
+bound is that of the likelihood ratio (appendix G.3), penalised for few flaws. Undercuts are measured on every weld: their signals are a linear
 function of the depth, left-censored at zero, and the bound is a tolerance limit (Wald's of appendix G.2 is too small).
 """
 
@@ -86,8 +86,11 @@ class ProbabilityOfDetection(Fitted, frozen=True):
 def fit_hit_miss(depth_mm: np.ndarray, found: np.ndarray) -> Fitted:
     """Fit a logistic of the logarithm of the depth to hits and misses.
 
-    The bound of a90 is that of the one-sided profile likelihood (chi-square's 90 % quantile, one degree of freedom). It
-    also exists if hits and misses do not overlap.
+    The bound of a90 is that of the one-sided profile likelihood (chi-square's 90 % quantile, one degree of freedom). Its
+    plain form holds in 70 to 93 % of draws of 40 flaws: few are neither surely found nor surely missed. Therefore the
+    likelihood is multiplied by a power of the determinant of the information (Firth, Biometrika 80, 1993, 27-38; Heinze
+    and Schemper, Statistics in Medicine 21, 2002, 2409-2419). With the power 1/3 instead of Firth's 1/2 the bound holds
+    in 94 to 100 %, and is smaller. It also exists if hits and misses do not overlap.
 
     Parameters
     ----------
@@ -102,25 +105,25 @@ def fit_hit_miss(depth_mm: np.ndarray, found: np.ndarray) -> Fitted:
 
     def loss(at_90: float, slope: float) -> float:
         logit = odds + slope * (x - at_90)
-        return float(np.sum(np.logaddexp(0, np.where(found, -logit, logit))))
+        weight = special.expit(logit) * special.expit(-logit) + 1e-300  # the logarithm of no weight is not finite
+        about = x - weight @ x / weight.sum()
+        information = math.log(weight.sum()) + math.log(weight @ about**2)
+        return -float(np.sum(special.log_expit(np.where(found, logit, -logit)))) - information / 3
 
-    def best_slope(at_90: float) -> tuple[float, float]:
-        logarithm, least = _minimise(lambda s: loss(at_90, math.exp(s)), _SLOPES)
-        return least, math.exp(logarithm)
+    def profile(at_90: float) -> tuple[float, float]:
+        return _minimise(lambda logarithm: loss(at_90, math.exp(logarithm)), _SLOPES)
 
-    # The likelihood is concave in intercept and slope, so that its profile has one maximum.
     ends = float(x.min()) - 1, float(x.max()) + 1
-    at_90, least = _minimise(lambda at: best_slope(at)[0], ends)
+    at_90, least = _minimise(lambda at: profile(at)[1], ends)
     if min(at_90 - ends[0], ends[1] - at_90) < 1e-3:
         return Fitted()
     limit = least + 0.5 * float(stats.chi2.ppf(2 * _ONE_SIDED - 1, 1))
     bound = None
-    if best_slope(ends[1])[0] > limit:
-        crossing = optimize.root_scalar(lambda at: best_slope(at)[0] - limit, bracket=(at_90, ends[1]), xtol=1e-4)
+    if profile(ends[1])[1] > limit:
+        crossing = optimize.root_scalar(lambda at: profile(at)[1] - limit, bracket=(at_90, ends[1]), xtol=1e-4)
         bound = math.exp(crossing.root)
-    slope = best_slope(at_90)[1]
-    at_50 = at_90 - odds / slope
-    return Fitted(a90_mm=math.exp(at_90), a90_95_mm=bound, location=at_50, scale=1 / slope)
+    scale = math.exp(-profile(at_90)[0])
+    return Fitted(a90_mm=math.exp(at_90), a90_95_mm=bound, location=at_90 - odds * scale, scale=scale)
 
 
 def _minimise(of: Callable[[float], float], ends: tuple[float, float]) -> tuple[float, float]:
