@@ -206,11 +206,6 @@ PAGES_RUN = {
     "docs/explanation/tests.md": Page(
         instead={"pytest": f"pytest --collect-only -q {ROOT / 'tests/test_public_api.py'}"}
     ),
-    "docs/how-to/accept-a-sensor.md": Page(
-        given={"calibration.json": "calibration.json", "bar-near.h5": "spheres.h5", "bar-far.h5": "today.h5"}
-        | {"plate.h5": "plane.h5", "step.h5": "step-scan.h5"},
-        tables={"acceptance.toml": 0},
-    ),
     "docs/how-to/add-a-target.md": Page(
         instead={'kind: Literal["plain circles"] = "plain circles"': 'kind: Literal["plain"] = "plain"'}
     ),
