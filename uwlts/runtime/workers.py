@@ -347,9 +347,9 @@ def _serve(connection: Connection) -> None:
 
 
 def _receive(connection: Connection, jobs: SimpleQueue[bytes]) -> None:
-    """Pass on jobs as pickled; stop the process at the end of the connection, which is that of its parent at the latest.
+    """Pass on pickled jobs, and stop the process when its parent closes the connection or ends.
 
-    A thread of its own notices that end while a library computes, when no handler of a signal runs.
+    In a thread, because no handler of a signal runs while a library computes.
     """
     with suppress(EOFError, OSError):
         while True:
