@@ -269,9 +269,6 @@ PAGES_RUN = {
         prepare={"uwlts reconstruct pass.h5 --calibration calibration.json --mount mount.json --traj": correct_nothing},
         not_run={"uwlts align pass.cloud.h5": ALIGNED_ELSEWHERE},
     ),
-    "docs/reference/digital-certificate.md": Page(
-        given={"calibration.json": "calibration.json"}, tables={"administration.toml": 0}
-    ),
     "docs/reference/api.md": Page(given={name: name for name in ("target-air.h5", "target-water.h5", "spheres.h5")}),
     "docs/tutorials/calibrate-a-sensor.md": Page(
         small_python=True,

@@ -193,10 +193,8 @@ def certificate(
 
     calibration = call.given["calibration"]
     if check is not None:
-        if call.given.keys() & {"out", "before", "administration"}:
-            raise DescriptionError(
-                "`check` verifies and writes nothing: give it without `out`, `before` and `administration`"
-            )
+        if call.given.keys() & {"out", "before"}:
+            raise DescriptionError("`check` verifies and writes nothing: give it without `out` and `before`")
         against = uwlts.report.check_certificate(check, calibration)
         say("\n".join(against) or f"{check} is unchanged, and belongs to {calibration}")
         if against:
@@ -205,8 +203,6 @@ def certificate(
     page, content = call()
     show(certificate_lines(content))
     wrote_page(page)
-    if "administration" in call.given:
-        say(f"wrote {page.with_suffix('.xml')}")
 
 
 @command_from(app, uwlts, "verify", job="Calibrate")

@@ -20,7 +20,6 @@ from uwlts.model.placement import check_design, view_of_sheet
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.model.trajectory import Trajectory, format_time
 from uwlts.report.certificate import parameter_rows
-from uwlts.report.digital_certificate import digital_certificate_lines
 from uwlts.storage.calibration_file import FORMAT as CALIBRATION, POLYNOMIALS_FORMAT, load_calibration
 from uwlts.storage.capture import FORMAT as CAPTURE, Capture
 from uwlts.storage.cloud import PointCloud
@@ -129,7 +128,7 @@ _DESCRIPTIONS = (
 
 
 def describe(path: str | Path, *, unit: Unit | None = None, pose_format: PoseFormat = SAVED_FORMAT) -> str:
-    """Describe a file that `read` reads, a digital calibration certificate, a sensor (by name or path), or a plan.
+    """Describe a file that `read` reads, a sensor (by name or path), or a plan.
 
     Parameters
     ----------
@@ -154,8 +153,6 @@ def describe(path: str | Path, *, unit: Unit | None = None, pose_format: PoseFor
     endings = [each for each in path.suffixes if each != ".part"]
     if (not endings and not path.is_dir()) or endings[-1:] == [".toml"]:
         lines = _name_description(path) or sensor_lines(load_sensor(name))
-    elif endings[-1:] == [".xml"]:
-        lines = digital_certificate_lines(path)
     elif endings[-2:] == [".truth", ".h5"] or (endings[-1:] == [".h5"] and read_format(path) == TRUTH):
         lines = truth_lines(*read_truth(path))
     else:
