@@ -1,5 +1,4 @@
 from . import desk as desk, report as report
-from .acceptance.accept import accept as accept
 from .alignment.align import align_trajectory as align_trajectory
 from .calibration.calibrate import calibrate as calibrate
 from .calibration.camera.photographs import calibrate_camera as calibrate_camera

@@ -186,11 +186,6 @@ PAGES_RUN = {
     "docs/explanation/tests.md": Page(
         instead={"pytest": f"pytest --collect-only -q {ROOT / 'tests/test_public_api.py'}"}
     ),
-    "docs/how-to/accept-a-sensor.md": Page(
-        given={"calibration.json": "calibration.json", "bar-near.h5": "spheres.h5", "bar-far.h5": "today.h5"}
-        | {"plate.h5": "plane.h5", "step.h5": "step-scan.h5"},
-        tables={"acceptance.toml": 0},
-    ),
     "docs/how-to/add-a-target.md": Page(
         instead={'kind: Literal["plain circles"] = "plain circles"': 'kind: Literal["plain"] = "plain"'}
     ),
@@ -246,9 +241,6 @@ PAGES_RUN = {
     "docs/how-to/scan-from-a-vehicle.md": Page(
         prepare={"uwlts reconstruct pass.h5 --calibration calibration.json --mount mount.json --traj": correct_nothing},
         not_run={"uwlts align pass.cloud.h5": ALIGNED_ELSEWHERE},
-    ),
-    "docs/reference/digital-certificate.md": Page(
-        given={"calibration.json": "calibration.json"}, tables={"administration.toml": 0}
     ),
     "docs/reference/api.md": Page(given={name: name for name in ("target-air.h5", "target-water.h5", "spheres.h5")}),
     "docs/tutorials/calibrate-a-sensor.md": Page(
