@@ -41,7 +41,7 @@ MEANING = {
         "--pixels": "Whether pixels are square",
         "--page": "Page to write, with all figures",
         "--pdf": "Also print the page",
-        "--plan": "[Pp]lan of (a scan|an acceptance test)|TOML file with sensor, medium, positions",
+        "--plan": "[Pp]lan of a scan|TOML file with sensor, medium, positions",
         "--port": "[Pp]ort of the page",
         "--pose-format": "euler-ZYX-deg",
         "--pose-std-deg": "Standard uncertaint",

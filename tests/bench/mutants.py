@@ -35,7 +35,7 @@ ALSO = {
     "uwlts/calibration/joint": ["tests/uwlts/calibration", "tests/uwlts/reconstruction"],
     "uwlts/calibration/mount": ["tests/uwlts/calibration/mount"],
     "uwlts/cli": [f"tests/system/test_{name}.py" for name in ("command_lines", "command_errors", "inputs_kept")],
-    "uwlts/evaluation": ["tests/uwlts/acceptance", "tests/uwlts/reconstruction/test_point_uncertainty.py"],
+    "uwlts/evaluation": ["tests/uwlts/reconstruction/test_point_uncertainty.py"],
     "uwlts/fitting": [f"tests/uwlts/{name}" for name in ("shapes", "evaluation", "registration", "inspection")],
     "uwlts/optics": [f"tests/uwlts/{name}" for name in ("reconstruction", "calibration", "thesis")],
     "uwlts/reconstruction": ["tests/uwlts/report", "tests/system/test_joint_command.py"],

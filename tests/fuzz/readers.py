@@ -32,7 +32,6 @@ from twin.scene.campaign import load_campaign
 from twin.scene.description import Mesh, load_scene
 from twin.scene.finish import read_grey
 from twin.scene.objects import _load_surface
-from uwlts.acceptance.accept import read_acceptance
 from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.mount.calibrate_mount import calibrate_mount
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
@@ -43,7 +42,6 @@ from uwlts.hardware.scan_plan import load_plan
 from uwlts.model.artefacts import read_artefact
 from uwlts.model.library import library_folder, load_sensor
 from uwlts.optics.nominal import nominal_calibration
-from uwlts.report.acceptance_page import acceptance_page
 from uwlts.report.certificate import check_certificate, make_certificate
 from uwlts.report.file_description import describe
 from uwlts.storage.calibration_file import describe_verification, load_calibration
@@ -130,26 +128,6 @@ def _evaluation(path: Path) -> None:
     path.write_text(
         json.dumps(content | {"uncertainty": {"D": dict.fromkeys(("random_mm", "systematic_mm", "expanded_mm"), 0.1)}})
     )
-
-
-def _acceptance(path: Path) -> None:
-    spheres = {"kind": "spheres", "diameters_mm": [25.0, 25.0], "spacings_mm": [60.0], "spacing_uncertainty_mm": 0.006}
-    plan = {
-        "title": "a",
-        "volume_mm": [9.0, 9.0, 9.0],
-        "mpe": {"SD_mm": 0.1},
-        "artefacts": {"b": {"standard": spheres}},
-    }
-    plan |= {"positions": [{"name": "c", "artefact": "b", "file": "d.ply"}]}
-    place = {"place_mm": [0.0, 0.0, 0.0], "direction": [0.0, 1.0, 0.0], "length_mm": 60.0}
-    value = {"symbol": "SD", "position": "c", "label": "spacing", "value_mm": 0.01, "expanded_mm": 0.006} | place
-    judged = {**plan["positions"][0], "state": "judged", "values": [value]}
-    worst = {"symbol": "SD", "worst": value, "count": 1, "mpe_mm": 0.1, "decision": "conformity proven"}
-    few = {"clause": "f", "required": "at least 7", "done": "1", "met": False}
-    content = {"plan": plan, "positions": [judged], "characteristics": [worst], "requirements": [few], "remarks": ["e"]}
-    content |= {"verdict": "conformity proven", "conclusion": "conformity proven: g"}
-    content |= {"calibration": None, "software": "uwlts 1", "date": "2026-01-02T03:04:05+00:00"}
-    path.write_text(json.dumps({"format": "uwlts-acceptance", "version": 2} | content))
 
 
 def _cloud(path: Path) -> None:
@@ -423,7 +401,6 @@ READERS = {
         Reader("polynomials", ".json", "json", _polynomials, load_calibration),
         Reader("certificate", ".json", "json", _certificate, lambda path: check_certificate(path, _certified(path))),
         Reader("evaluation", ".json", "json", _evaluation, read_evaluation),
-        Reader("acceptance", ".json", "json", _acceptance, lambda path: acceptance_page(read_acceptance(path))),
         Reader("header", ".json", "json", _header, read_header),
         Reader("described", ".json", "json", _nominal, describe),
         Reader("capture", ".h5", "hdf5", _capture, _all_of_capture),

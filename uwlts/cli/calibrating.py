@@ -193,10 +193,8 @@ def certificate(
 
     calibration = call.given["calibration"]
     if check is not None:
-        if call.given.keys() & {"out", "before", "administration"}:
-            raise DescriptionError(
-                "`check` verifies and writes nothing: give it without `out`, `before` and `administration`"
-            )
+        if call.given.keys() & {"out", "before"}:
+            raise DescriptionError("`check` verifies and writes nothing: give it without `out` and `before`")
         against = uwlts.report.check_certificate(check, calibration)
         say("\n".join(against) or f"{check} is unchanged, and belongs to {calibration}")
         if against:
@@ -205,8 +203,6 @@ def certificate(
     page, content = call()
     show(certificate_lines(content))
     wrote_page(page)
-    if "administration" in call.given:
-        say(f"wrote {page.with_suffix('.xml')}")
 
 
 @command_from(app, uwlts, "verify", job="Calibrate")
@@ -223,48 +219,4 @@ def verify(call: Call) -> None:
     except OutputError as error:
         warn(f"the verdict is not kept: {error}")
     if not verification.passed:
-        sys.exit(1)
-
-
-@command_from(app, uwlts, "accept", job="Calibrate", also=[(uwlts.report, "write_acceptance")])
-def accept(
-    call: Call,
-    *,
-    out: Annotated[
-        Path | None,
-        Parameter(
-            help="Page to write, with the result as sealed JSON beside it; by default PLAN.acceptance.html, or "
-            "PLAN.html if PLAN ends with acceptance. An earlier result of the same plan is continued and replaced."
-        ),
-    ] = None,
-    pdf=False,
-    overwrite: Overwrite = False,
-) -> None:
-    """Exit code 0 only if conformity is proven for everything in the plan, or accepted by simple acceptance.
-
-    Example: uwlts accept acceptance.toml --pdf
-    """
-    from uwlts.acceptance.accept import Acceptance
-    from uwlts.acceptance.acceptance_plan import load_plan
-    from uwlts.pages.toolkit import json_beside, refuse_unsuitable_page
-    from uwlts.report.acceptance_page import KIND
-
-    plan = Path(call.given["plan"])
-    page = out or plan.with_suffix(".html" if plan.stem.endswith(KIND) else f".{KIND}.html")
-    result = json_beside(page, KIND)
-    if result.is_file() and not overwrite:
-        # The command continues its own result.
-        known, title = uwlts.read(result), load_plan(plan).title
-        if not isinstance(known, Acceptance) or known.plan.title != title:
-            raise OutputError(
-                f"{result} is not of the test {title!r}: give another `out`, or `overwrite` to replace it"
-            )
-        call.given.setdefault("earlier", known)
-        overwrite = True
-    refuse_unsuitable_page(page, kind=KIND, overwrite=overwrite)
-    found = call()
-    show(found.lines())
-    uwlts.report.write_acceptance(page, found, pdf=pdf, overwrite=overwrite)
-    say(f"wrote {page}, {result.name}" + (f", {page.with_suffix('.pdf').name}" if pdf else ""))
-    if found.verdict not in ("conformity proven", "accepted"):
         sys.exit(1)

@@ -1,5 +1,4 @@
 from . import plot as plot
-from .acceptance_page import write_acceptance as write_acceptance
 from .calibration_pages import write_camera as write_camera, write_recalibration as write_recalibration
 from .certificate import check_certificate as check_certificate
 from .certificate_page import write_certificate as write_certificate

@@ -13,7 +13,6 @@ from markupsafe import Markup
 
 from uwlts.calibration.joint.observability import list_regions
 from uwlts.calibration.joint.stored_estimate import require_joint
-from uwlts.files.writing import refuse_unsuitable, write_file
 from uwlts.model.calibration import Calibration
 from uwlts.model.joint_estimate import ImageFit, Origin
 from uwlts.model.parameter_keys import ParameterKey
@@ -38,12 +37,6 @@ from uwlts.report.certificate_volume import (
     require_same_sensor,
     uncertainty_maps,
 )
-from uwlts.report.digital_certificate import (
-    Administration,
-    digital_certificate,
-    load_administration,
-    state_traceability,
-)
 from uwlts.report.plot import DEVIATIONS
 from uwlts.storage.calibration_file import read_calibration
 
@@ -51,12 +44,7 @@ _WORST_IMAGES = 5  # listed
 
 
 def write_certificate(
-    calibration: str | Path,
-    *,
-    out: str | Path | None = None,
-    before: str | Path | None = None,
-    administration: str | Path | None = None,
-    overwrite: bool = False,
+    calibration: str | Path, *, out: str | Path | None = None, before: str | Path | None = None, overwrite: bool = False
 ) -> tuple[Path, Certificate]:
     """Write the certificate of a calibration: a page to read and print, and its content as sealed JSON.
 
@@ -68,9 +56,6 @@ def write_certificate(
         Page to write (default: CALIBRATION.certificate.html). The JSON is written beside it.
     before : str or Path, optional
         Another calibration of the same sensor to compare with.
-    administration : str or Path, optional
-        TOML file with laboratory, customer, item and persons. With it, the certificate is also written as digital
-        calibration certificate (DCC, XML) beside the page.
     overwrite : bool
         Replace existing files.
 
@@ -87,38 +72,23 @@ def write_certificate(
         A calibration cannot be read.
     CalibrationError
         The calibration is not a joint one, its estimate is damaged, or the other calibration is of another sensor.
-    DescriptionError
-        The administrative data are not valid.
     """
     source = Path(calibration)
     page = Path(out or source.with_name(f"{source.stem}.certificate.html"))
-    digital = page.with_suffix(".xml")
     refuse_unsuitable_page(page, overwrite=overwrite)
-    stated = None if administration is None else load_administration(administration)
-    if stated is not None:
-        refuse_unsuitable(digital, overwrite=overwrite)
     known = read_calibration(source)
     content = make_certificate(known, source, issued=datetime.now(UTC).isoformat(timespec="seconds"))
     earlier = None if before is None else (Path(before).name, read_calibration(before))
-    text = certificate_page(content, known, before=earlier, administration=stated)
+    text = certificate_page(content, known, before=earlier)
     sealed = json.dumps(content.in_file(), indent=2, ensure_ascii=False) + "\n"
-    if stated is not None:
-        xml = digital_certificate(content, stated)
-        write_file(digital, xml, overwrite=overwrite)
     write_page(page, text, beside=sealed, overwrite=overwrite)
     return page, content
 
 
 def certificate_page(
-    content: Certificate,
-    calibration: Calibration,
-    *,
-    before: tuple[str, Calibration] | None = None,
-    administration: Administration | None = None,
+    content: Certificate, calibration: Calibration, *, before: tuple[str, Calibration] | None = None
 ) -> str:
     """Return the page as text; ``before`` is the name and content of another calibration of the sensor to compare with.
-
-    The ``administration`` states measuring equipment and traceability.
 
     CalibrationError if the joint estimate is damaged, or the other calibration is of another sensor.
     """
@@ -133,8 +103,6 @@ def certificate_page(
         known_before=content.made_from.get("known_before", {}),
         parameters=_list_parameters(content.parameters, before),
         before=None if before is None else before[0],
-        equipment=administration.equipment if administration is not None else (),
-        traceability=state_traceability(content, administration)[1],
         lengths=_list_lengths(content.lengths),
         drawn=_pictures(content, calibration, before),
     )

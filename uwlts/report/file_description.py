@@ -9,7 +9,6 @@ import numpy as np
 from pydantic import JsonValue
 from scipy.spatial.transform import Rotation
 
-from uwlts.acceptance.accept import FORMAT as ACCEPTANCE, Acceptance, read_acceptance
 from uwlts.errors import CaptureError
 from uwlts.evaluation.evaluate import FORMAT as EVALUATION, Evaluation, read_evaluation
 from uwlts.files.json_files import numbers_in, read_json
@@ -21,7 +20,6 @@ from uwlts.model.placement import check_design, view_of_sheet
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.model.trajectory import Trajectory, format_time
 from uwlts.report.certificate import parameter_rows
-from uwlts.report.digital_certificate import digital_certificate_lines
 from uwlts.storage.calibration_file import FORMAT as CALIBRATION, POLYNOMIALS_FORMAT, load_calibration
 from uwlts.storage.capture import FORMAT as CAPTURE, Capture
 from uwlts.storage.cloud import PointCloud
@@ -35,19 +33,18 @@ from uwlts.storage.pose_files import SAVED_FORMAT, PoseFormat, holds_trajectory,
 from uwlts.storage.truth import FORMAT as TRUTH, Truth, TruthHeader, TruthStatus, read_truth
 
 _TABLES = (".csv", ".txt", ".asc")  # endings of text with a cloud or a trajectory
-_Stored = AnyCalibration | Mount | Evaluation | Acceptance | FigureTable
+_Stored = AnyCalibration | Mount | Evaluation | FigureTable
 _Readable = Capture | PointCloud | SurfaceMesh | Truth | Trajectory | _Stored
 _JSON_READERS: dict[str, Callable[[Path], _Stored]] = {
     CALIBRATION: load_calibration,
     POLYNOMIALS_FORMAT: load_calibration,
     MOUNT: read_mount,
     EVALUATION: read_evaluation,
-    ACCEPTANCE: read_acceptance,
     FIGURES: read_figures,
 }
 _READABLE = (
     f"captures and ground truth (.h5), clouds ({', '.join(CLOUD_ENDINGS)}), meshes ({', '.join(MESH_FORMATS)}), "
-    "calibrations, mounts, acceptance tests, figures and evaluations (.json), trajectories (.csv, .tum, ROS bags)"
+    "calibrations, mounts, figures and evaluations (.json), trajectories (.csv, .tum, ROS bags)"
 )
 
 
@@ -74,7 +71,7 @@ def read(
 
     Returns
     -------
-    Capture, PointCloud, SurfaceMesh, Truth, Mount, Evaluation, Acceptance, FigureTable, Trajectory or a calibration
+    Capture, PointCloud, SurfaceMesh, Truth, Mount, Evaluation, FigureTable, Trajectory or a calibration
         An opened capture must be closed, or used in a ``with`` statement.
 
     Raises
@@ -118,7 +115,6 @@ def read(
 
 
 _DESCRIPTIONS = (
-    ("plan of an acceptance test", ({"volume_mm", "mpe"},), "uwlts accept"),
     ("campaign", ({"recordings"},), "twin predict --campaign, twin experiment --campaign"),
     ("data set", ({"vary"},), "twin dataset"),
     ("design study", ({"variables", "title"}, {"choices", "title"}), "twin sweep"),
@@ -132,7 +128,7 @@ _DESCRIPTIONS = (
 
 
 def describe(path: str | Path, *, unit: Unit | None = None, pose_format: PoseFormat = SAVED_FORMAT) -> str:
-    """Describe a file that `read` reads, a digital calibration certificate, a sensor (by name or path), or a plan.
+    """Describe a file that `read` reads, a sensor (by name or path), or a plan.
 
     Parameters
     ----------
@@ -157,8 +153,6 @@ def describe(path: str | Path, *, unit: Unit | None = None, pose_format: PoseFor
     endings = [each for each in path.suffixes if each != ".part"]
     if (not endings and not path.is_dir()) or endings[-1:] == [".toml"]:
         lines = _name_description(path) or sensor_lines(load_sensor(name))
-    elif endings[-1:] == [".xml"]:
-        lines = digital_certificate_lines(path)
     elif endings[-2:] == [".truth", ".h5"] or (endings[-1:] == [".h5"] and read_format(path) == TRUTH):
         lines = truth_lines(*read_truth(path))
     else:
@@ -199,7 +193,7 @@ def _describe_content(found: object) -> list[str]:
             return cloud_lines(found)
         case Trajectory():
             return trajectory_lines(found)
-        case Acceptance() | SurfaceMesh():
+        case SurfaceMesh():
             return found.lines()
         case _:
             return repr(found).splitlines()

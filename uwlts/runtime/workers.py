@@ -2,15 +2,15 @@
 
 `run_jobs` runs a list of jobs in processes that it starts and ends. `open_workers` keeps processes (or the workers
 of a Dask scheduler) for several rounds of jobs, and survives jobs whose process dies. These processes
-always end with their command. `concurrent.futures` completes running and queued jobs before a command ends, and leaves
-processes behind if the command is killed.
+always end with their command, and stopped jobs remove their incomplete files. `concurrent.futures` completes running
+jobs before a command ends, and leaves processes behind if the command is killed; loky kills processes amid their jobs.
 """
 
 import gc
 import multiprocessing
 import os
+import pickle
 import signal
-import socket
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -24,6 +24,7 @@ from itertools import islice
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
+from queue import SimpleQueue
 from typing import Any, Literal, TypeVar, assert_never
 
 from uwlts.errors import Error, SetupError
@@ -245,20 +246,16 @@ class _Process:
         # Not a daemon, because daemons cannot start processes; it watches its parent itself.
         self._process = context.Process(target=_serve, args=(self._theirs,))
         self._threads = threads
-        self._work: Callable[[Any, Send], Any] | None = None
 
     def give(self, work: Callable[[Any, Send], Any], job: Any) -> None:
-        """Send a job, and its function if that is new."""
+        """Send a job and its function."""
         if self._process.pid is None:
             with _STARTING:
                 _start(self._process, self._threads)
             self._theirs.close()
         # If the process has ended, `message` reports it.
         with suppress(BrokenPipeError):
-            if work is not self._work:
-                self.connection.send(("work", work))
-                self._work = work
-            self.connection.send(("job", job))
+            self.connection.send((work, job))
 
     def message(self) -> tuple[Literal["message", "raised", "done"], Any] | Lost:
         """Receive a message of the job, its result ("done"), its error ("raised"), or the end of the process."""
@@ -276,10 +273,8 @@ class _Process:
 
     def stop(self, *, at_once: bool) -> None:
         """Ask the process to end, after its job or at once."""
-        if self._process.pid is None:
-            return
         if at_once:
-            self._process.terminate()
+            self.connection.close()
         else:
             with suppress(OSError):
                 self.connection.send(None)
@@ -328,25 +323,15 @@ def _serve(connection: Connection) -> None:
         except BrokenPipeError:
             stop()
 
-    work: Callable[[Any, Send], Any] | None = None
-    frozen = False
+    jobs, frozen = SimpleQueue[bytes](), False
     try:
         signal.signal(signal.SIGTERM, stop)
-        # The socket becomes readable at a signal, even while a library computes and no handler runs. No warning if it
-        # is full: one signal suffices.
-        reader, writer = socket.socketpair()
-        writer.setblocking(False)
-        signal.set_wakeup_fd(writer.detach(), warn_on_full_buffer=False)
-        threading.Thread(target=_end_when_stopped, args=(reader,), daemon=True).start()
+        threading.Thread(target=_receive, args=(connection, jobs), daemon=True).start()
         with preserve_interrupts():
-            while (given := connection.recv()) is not None:
-                kind, content = given
-                if kind == "work":
-                    work = content
-                    continue
-                assert work is not None
+            while (given := pickle.loads(jobs.get())) is not None:
+                work, job = given
                 try:
-                    result = work(content, partial(send, "message"))
+                    result = work(job, partial(send, "message"))
                 except (Error, OSError) as error:
                     send("raised", error)
                 else:
@@ -361,17 +346,15 @@ def _serve(connection: Connection) -> None:
             os._exit(1)
 
 
-def _end_when_stopped(signals: socket.socket) -> None:
-    """End the process after a signal, or after the end of its parent process."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    while True:
-        ready = wait([parent.sentinel, signals])
-        if signals in ready and signal.SIGTERM in signals.recv(64):
-            break
-        if parent.sentinel in ready:
-            os.kill(os.getpid(), signal.SIGTERM)
-            break
+def _receive(connection: Connection, jobs: SimpleQueue[bytes]) -> None:
+    """Pass on pickled jobs, and stop the process when its parent closes the connection or ends.
+
+    In a thread, because no handler of a signal runs while a library computes.
+    """
+    with suppress(EOFError, OSError):
+        while True:
+            jobs.put(connection.recv_bytes())
+    os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(_GRACE_S)
     remove_incomplete()
     os._exit(1)

@@ -61,7 +61,6 @@ def test_other_files_are_refused_with_what_is_read(tmp_path: Path, name: str, te
 @pytest.mark.parametrize(
     ("content", "kind"),
     [
-        ('title = "a"\nvolume_mm = [1, 1, 1]\n[mpe]\n', "plan of an acceptance test: a"),
         ('base = "demo"\ntitle = "b"\nrecordings = []\n', "campaign: b"),
         ('title = "c"\n[variables]\n', "design study: c"),
         ('client = "d"\n[datum]\n', "order of a report"),

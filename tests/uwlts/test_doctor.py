@@ -19,13 +19,13 @@ from packaging.requirements import Requirement
 
 from tests.system.in_process import uwlts
 from twin.devices.grbl_controller import BENCH_SETTINGS, GrblController
-from uwlts.doctor import machine
-from uwlts.doctor.machine import Finding, examine_renderer
+from uwlts import doctor as machine
+from uwlts.doctor import Finding, examine_renderer
 from uwlts.errors import SetupError
 from uwlts.runtime import optional_library
 from uwlts.runtime.optional_library import EXTRAS
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 NOBODY = 65534
 
 
@@ -43,7 +43,7 @@ def as_nobody(program: str) -> str:
     """Output of a program that gives up administrator rights after its imports."""
     start = f"""
         import os
-        from uwlts.doctor.machine import examine_ports
+        from uwlts.doctor import examine_ports
         if os.geteuid() == 0:
             os.setgroups([])
             os.setresgid({NOBODY}, {NOBODY}, {NOBODY})
@@ -119,10 +119,10 @@ def test_the_requirements_are_the_projects_own():
 def test_an_installed_package_lists_its_requirements_without_a_checkout(tmp_path):
     face = [
         ROOT / "uwlts" / name
-        for name in ("__init__.py", "__init__.pyi", "_version.py", "argument_types.py", "errors.py")
+        for name in ("__init__.py", "__init__.pyi", "_version.py", "argument_types.py", "errors.py", "doctor.py")
     ]
     progress = [ROOT / "uwlts" / "runtime" / name for name in ("__init__.py", "optional_library.py", "progress.py")]
-    for source in [*face, *progress, *(ROOT / "uwlts" / "doctor").glob("*.py")]:
+    for source in [*face, *progress]:
         copy = tmp_path / source.relative_to(ROOT)
         copy.parent.mkdir(parents=True, exist_ok=True)
         copy.write_bytes(source.read_bytes())
@@ -132,7 +132,7 @@ def test_an_installed_package_lists_its_requirements_without_a_checkout(tmp_path
         "Requires-Dist: winonly; sys_platform == 'win32'\nRequires-Dist: laspy>=2; extra == 'clouds'\n"
         "Requires-Dist: anything; extra == 'test'\n"
     )
-    program = "from uwlts.doctor import machine; print(machine.read_requirements())"
+    program = "from uwlts.doctor import read_requirements; print(read_requirements())"
     ended = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert ended.stdout.strip() == str(
         (">=3.11", ["numpy>=2"], {extra: [] for extra in EXTRAS} | {"clouds": ["laspy>=2"]})
@@ -193,7 +193,7 @@ def test_an_invalid_libllvm_gives_a_warning_with_the_install_command(tmp_path, m
 
 def test_an_aravis_that_does_not_load_is_a_warning_that_says_how_to_get_it(tmp_path):
     (tmp_path / "libaravis.so").write_text("not a library")
-    program = "from uwlts.doctor.machine import examine_cameras; print(*examine_cameras(), sep='\\n')"
+    program = "from uwlts.doctor import examine_cameras; print(*examine_cameras(), sep='\\n')"
     ended = subprocess.run(
         [sys.executable, "-c", program],
         cwd=ROOT,

@@ -1,7 +1,7 @@
-"""Findings about libraries, renderer, cameras and ports, with trials of a camera and a stage, and their table.
+"""Examination of this machine for rendering, calibration and scanning, with advice, and its table.
 
-The stage is not moved and the laser stays off. The trial only sends queries, and Ctrl-X at the end, which switches the
-laser's pin off.
+The stage is not moved and the laser stays off: a trial only sends queries, and Ctrl-X at the end, which switches the
+laser's pin off. No files are left.
 """
 
 import os
@@ -10,8 +10,9 @@ import shlex
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from importlib import metadata
 from importlib.util import find_spec
 from typing import Literal
@@ -22,6 +23,7 @@ from rich.text import Text
 
 from uwlts.errors import Error, HardwareError, SetupError
 from uwlts.runtime.optional_library import ARAVIS_VARIABLE, EXTRAS, load_aravis, pip_install, read_requirements
+from uwlts.runtime.progress import ProgressListener, ignore_progress
 
 try:
     import grp
@@ -51,6 +53,46 @@ class Finding:
     def from_advice(cls, subject: str, found: str, advice: str) -> "Finding":
         """Return a warning if there is advice, else ok."""
         return cls(subject, "warning" if advice else "ok", found, advice)
+
+
+def examine(
+    *, camera: str | None = None, stage: str | None = None, progress: ProgressListener = ignore_progress
+) -> list[Finding]:
+    """Examine libraries, renderer, cameras and serial ports of this machine, with advice.
+
+    It takes about ten seconds.
+
+    Parameters
+    ----------
+    camera
+        Address of a camera to take ten frames: gige:NAME or replay:PATH. Its trigger
+        is switched off, and its whole image is read out.
+    stage
+        Serial port of a stage, whose version, settings and state are read. It is not moved and the laser stays off, but
+        an Arduino Uno restarts: home before the next scan.
+    progress
+        Called with the number of finished parts and the total.
+
+    Returns
+    -------
+    list of Finding
+        Subject, status, result and advice of each check.
+    """
+    parts: list[Callable[[], Sequence[Finding]]] = [examine_libraries, examine_renderer, examine_cameras, examine_ports]
+    if camera is not None:
+        parts.append(partial(try_camera, camera))
+    if stage is not None:
+        parts.append(partial(try_stage, stage))
+    findings: list[Finding] = []
+    for done, part in enumerate(parts):
+        progress(done, len(parts))
+        try:
+            findings += part()
+        except ImportError as error:
+            found = f"a part was left out: {error}"
+            findings.append(Finding("examination", "missing", found, "install again the library that failed"))
+    progress(len(parts), len(parts))
+    return findings
 
 
 _ABSENT = "not installed"
