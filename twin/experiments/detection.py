@@ -1,7 +1,7 @@
 """Probability of detection of pits, dents and undercuts in rendered campaigns, after MIL-HDBK-1823A (2009).
 
 A search reports only what it finds: its hits and misses are a logistic function of the logarithm of the depth, and the
-bound is that of the likelihood ratio (appendix G.3), penalised for few flaws. Undercuts are measured on every weld: their signals are a linear
+bound is that of the likelihood ratio (appendix G.3). Undercuts are measured on every weld: their signals are a linear
 function of the depth, left-censored at zero, and the bound is a tolerance limit (Wald's of appendix G.2 is too small).
 """
 
@@ -86,11 +86,9 @@ class ProbabilityOfDetection(Fitted, frozen=True):
 def fit_hit_miss(depth_mm: np.ndarray, found: np.ndarray) -> Fitted:
     """Fit a logistic of the logarithm of the depth to hits and misses.
 
-    The bound of a90 is that of the one-sided profile likelihood (chi-square's 90 % quantile, one degree of freedom). Its
-    plain form holds in 70 to 93 % of draws of 40 flaws: few are neither surely found nor surely missed. Therefore the
-    likelihood is multiplied by a power of the determinant of the information (Firth, Biometrika 80, 1993, 27-38; Heinze
-    and Schemper, Statistics in Medicine 21, 2002, 2409-2419). With the power 1/3 instead of Firth's 1/2 the bound holds
-    in 94 to 100 %, and is smaller. It also exists if hits and misses do not overlap.
+    The bound of a90 is that of the one-sided profile likelihood (chi-square's 90 % quantile, one degree of freedom),
+    times a power of the information's determinant (Firth, Biometrika 80, 1993, 27-38). The plain likelihood's bound
+    holds in 70 to 93 % of draws of 40 flaws, with the power 1/3 in 94 to 100 %; Firth's 1/2 has larger bounds.
 
     Parameters
     ----------
