@@ -263,23 +263,22 @@ def _collect_pits(into: FlawFindings, scene: Scene, inspection: dict[str, Any]) 
     pipe, place = scene.objects[number], scene.object_poses()[number]
     assert isinstance(pipe, PittedPipe)
     scale, into_pipe, depths = np.array([1.0, pipe.diameter_mm / 2]), np.linalg.inv(place), pit_depths(pipe).tolist()
-    pits, reach = pit_places(pipe) * scale, pipe.pit_diameter_mm / 2
+    pits, reach = pit_places(pipe) * scale, pipe.pit_diameter_mm / 2 + _PLACE_MM
 
-    def on_surface(place_mm: list[float]) -> np.ndarray:
+    def distances_mm(place_mm: list[float]) -> np.ndarray:
         x, y, z = (into_pipe @ [*place_mm, 1.0])[:3]
-        return np.array([x, math.atan2(y, -z)]) * scale
+        return np.linalg.norm(pits - np.array([x, math.atan2(y, -z)]) * scale, axis=1)
 
     hollows = [each for each in inspection["features"] if each["kind"] in ("pit", "dent")]
     known: dict[int, dict[str, Any] | None] = {}
     for feature in hollows:
         # Neighbours that the search joined are found, too, but their depths are not measured.
         for whole, at in [(feature, feature["place_mm"]), *((None, at) for at in feature["hollows_mm"])]:
-            distance = np.linalg.norm(pits - on_surface(at), axis=1)
-            nearest = int(np.argmin(distance))
-            if distance[nearest] < reach + _PLACE_MM and known.get(nearest) is None:
+            nearest = int(np.argmin(distances_mm(at)))
+            if distances_mm(at)[nearest] < reach and known.get(nearest) is None:
                 known[nearest] = whole
     into.false_calls += sum(
-        bool(np.all(np.linalg.norm(pits - on_surface(each["place_mm"]), axis=1) > reach + _PLACE_MM))
+        bool(np.all(distances_mm(each["place_mm"]) > reach))
         for each in inspection["features"]
         if each["kind"] in ("pit", "dent", "protrusion")
     )
