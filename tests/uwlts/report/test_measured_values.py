@@ -10,9 +10,9 @@ import pytest
 from tests.uwlts.desk.test_analyses import step_cloud
 from uwlts.errors import DescriptionError, OutputError
 from uwlts.evaluation.figures import FigureUncertainty
-from uwlts.inspection.picking import PickedMeasurement
+from uwlts.inspection.picking import MeasuredValues, PickedMeasurement, read_measured
 from uwlts.report import write_findings
-from uwlts.report.measured_values import MeasuredValues, read_measured, write_measured
+from uwlts.report.findings_page import write_measured
 
 WITHOUT = "the cloud has no uncertainty"
 # Expanded uncertainty 2 * sqrt(3^2 + 4^2) = 10 um.
