@@ -47,6 +47,12 @@ _TABLE_TOLERANCE_MM = 1e-6
 """Error of tabulated shifts, far below any relevant shift."""
 _LEFT_OUT_MM = 1e-9
 """Largest sum of omitted last terms of tables."""
+_PULL = [2.0, 3.0], [0.12, 0.0]
+"""Full widths at half maximum, px, and error of the profile fit with the place in the pixel, relative to the noise.
+
+Largest of simulated stripes in speckle: 0.12 for sigmas of 0.45 to 0.8 px, 0.04 for 1 px, 0.015 from 1.15 px on. Its
+sign changes with the width: the fitted pixels are a whole number, and the noise decides at their ends."""
+_LARGEST_NOISE_PX = 0.2  # noise above which a centre does not tell its place in the pixel
 _Arrays = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -118,11 +124,21 @@ def _median(values: np.ndarray) -> float:
     return 0.5 * (low + high)
 
 
+def estimate_pull_px(centre_px: np.ndarray, width_px: np.ndarray, noise_px: np.ndarray) -> np.ndarray:
+    """Estimate the possible errors (N,) of centres with their place in the pixel; the sign of all is unknown.
+
+    Normal noise of standard deviation s lowers the mean sine of measured centres by exp(-2 pi^2 s^2).
+    """
+    lowered = np.exp(-2 * np.pi**2 * np.minimum(noise_px, _LARGEST_NOISE_PX) ** 2)
+    return np.interp(width_px, *_PULL) * noise_px * np.sin(2 * np.pi * centre_px) / lowered
+
+
 def point_uncertainty(
     capture: Capture | FrameTable,
     calibration: Calibration,
     centres: _Arrays,
     *,
+    width_px: np.ndarray | None = None,
     blur_px: np.ndarray | None = None,
     beside_mm: np.ndarray | None = None,
     mount_by: np.ndarray | None = None,
@@ -135,9 +151,11 @@ def point_uncertainty(
     the stage's position, scale and direction about its central position, and drift of the water since the calibration,
     unless the calibration uses this capture. It excludes errors of poses (`uwlts.reconstruction.moving`).
 
-    ``centres`` are image, profile line and position in px of each stripe centre, three arrays (N,). ``blur_px`` (N,) is
-    the possible shift of the centres by blur, ``beside_mm`` (N, 3) the applied shift of the points to the origin of
-    their light (`uwlts.optics.brightness`); their relative errors are common to all points.
+    ``centres`` are image, profile line and position in px of each stripe centre, three arrays (N,). ``width_px`` (N,)
+    are full widths at half maximum: narrow stripes in speckle are shifted with their place in the pixel, those of a
+    level face alike. ``blur_px`` (N,) is the possible shift of the centres by blur, ``beside_mm`` (N, 3) the applied
+    shift of the points to the origin of their light (`uwlts.optics.brightness`). These relative errors are common to
+    all points.
 
     ``mount_by`` (6, P) are the derivatives of a calibrated mount by the parameters of the joint estimate
     (`uwlts.model.mount.SensorShare`), for frames with poses of a platform. They correlate the errors of points and
@@ -177,7 +195,10 @@ def point_uncertainty(
     beside = (
         np.zeros((len(line), 3)) if beside_mm is None else brightness_shift_std(header.sensor.uncertainty) * beside_mm
     )
-    blur = np.zeros(len(line)) if blur_px is None else BLUR_STD * blur_px
+    # Blur shifts the centres on steep surfaces, the place in the pixel those on level ones: they share a pattern.
+    shift = np.zeros(len(line)) if blur_px is None else BLUR_STD * blur_px
+    if width_px is not None:
+        shift += estimate_pull_px(centre_px, width_px, noise)
 
     def moved(some: slice, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the noise covariance (n, 6) of some points, and weighted sums (M, n, 3) of their error components."""
@@ -191,9 +212,9 @@ def point_uncertainty(
         else:
             series, row, at = table.combine(of_axes).shorten(_LEFT_OUT_MM).series(*where)
         random, sums = np.empty((len(row), 6), np.float32), np.empty((weights.shape[1], len(row), 3), np.float32)
-        image, error, by_blur, off = (np.ascontiguousarray(each[some]) for each in (frame, noise, blur, beside))
+        image, error, by_shift, off = (np.ascontiguousarray(each[some]) for each in (frame, noise, shift, beside))
         factors = weights[0], weights[1], np.ascontiguousarray(by_stage.T @ weights[2:])
-        errors, images, room = (error, by_blur, off), (pose_of, stage, image), np.empty(of_axes.shape[1])
+        errors, images, room = (error, by_shift, off), (pose_of, stage, image), np.empty(of_axes.shape[1])
         _fill_errors((series, row, at), images, errors, factors, room, random, sums)
         return random, sums
 
@@ -209,7 +230,7 @@ def point_uncertainty(
     along = header.sensor.uncertainty.stage_position_mm * np.array(header.stage_direction)
     position = np.where(posed[:, :, 0], 0.0, along).astype(np.float32)
     position = position[frame] if posed.any() else np.broadcast_to(position[:1], (len(frame), 3))
-    # Except for blur, the errors of sensor, stage and water are common to all scans in this medium.
+    # Except for shifts of the centres, the errors of sensor, stage and water are common to all scans in this medium.
     source = f"{digest or calibration_digest(calibration)} {header.medium_name} {header.stage_direction}"
     name = sha256(source.encode()).hexdigest()[:16]
     shared = {f"{WATER} {name}": weights[2:3].T, f"sensor {name}": np.delete(weights, [0, 2], axis=0).T}
@@ -231,7 +252,7 @@ def _fill_errors(
     ``table`` are series (L, n, 3 + 3 M), and row and place (N,) of each point. The series represent, for each axis, the
     derivative by the pixel across the stripe and the weighted sums of the estimate's error components. ``images`` are
     rotations (F, 3, 3) and stage positions (F,) of the images, and the image (N,) of each point. ``errors`` are noise
-    and blur (N,) in px, and brightness shift (N, 3). ``factors``, (M,), (M,) and (3, M), are those of blur, brightness
+    and shift (N,) in px, and brightness shift (N, 3). ``factors``, (M,), (M,) and (3, M), are those of blur, brightness
     shift and stage in the sums.
     """
     series, row, at = table

@@ -268,8 +268,8 @@ def reconstruct_stripes(
         if exact is None:
             raise CalibrationError("the calibration states no uncertainty: calibrate jointly (`water` or `joint`)")
         centres = kept.frame, kept.line, kept.centre_px
-        moved = {"blur_px": blur[good], "beside_mm": beside[good], "mount_by": mount_by, "chosen": chosen}
-        known = point_uncertainty(capture, exact, centres, **moved, digest=digest)
+        moved = {"width_px": kept.width_px, "blur_px": blur[good], "beside_mm": beside[good]}
+        known = point_uncertainty(capture, exact, centres, **moved, mount_by=mount_by, chosen=chosen, digest=digest)
     rays = np.bincount(found.status, minlength=len(RayStatus))
     return PointCloud(
         points_mm=points[good],
