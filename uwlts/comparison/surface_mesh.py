@@ -107,7 +107,7 @@ def mesh(
     if cube_mm is not None and cube_mm > radius:
         raise EvaluationError(f"cube_mm is {cube_mm:g}; expected at most the patches' radius, {radius:g} mm")
     points = _collect_points(scans, radius)
-    cube = cube_mm or max(min(radius / _CUBES_OF_RADIUS, _thinnest_wall(points, radius) / _CUBES_OF_WALL), radius / 16)
+    cube = cube_mm or max(min(radius / _CUBES_OF_RADIUS, _measure_walls(points, radius) / _CUBES_OF_WALL), radius / 16)
     surface = LocalSurface(points, radius_mm=radius)
     low = points.points_mm.min(axis=0) - 4 * cube
     vertices, faces = _march_cubes(*_compute_signed_distances(surface, points.points_mm, low, cube, progress))
@@ -187,7 +187,7 @@ def _collect_points(scans: list[tuple[PointCloud, np.ndarray]], radius: float) -
     return SurfacePoints(points, normals, weight, noise, position, image, patterns.T, owner)
 
 
-def _thinnest_wall(points: SurfacePoints, radius: float) -> float:
+def _measure_walls(points: SurfacePoints, radius: float) -> float:
     """Return the thickness of the thinnest walls (2 % quantile over the points); infinite without walls."""
     places, tree = points.points_mm, KDTree(points.points_mm)
     chosen = np.arange(len(places))[:: max(1, len(places) // _WALLS_ASKED)]

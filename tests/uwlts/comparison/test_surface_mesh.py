@@ -11,7 +11,7 @@ import uwlts
 from uwlts.cli import app
 from uwlts.comparison import surface_mesh
 from uwlts.comparison.change_reference import read_reference
-from uwlts.comparison.surface_mesh import _orient_faces, _remove_small_pieces, _split_scans, _thinnest_wall
+from uwlts.comparison.surface_mesh import _measure_walls, _orient_faces, _remove_small_pieces, _split_scans
 from uwlts.errors import CaptureError, EvaluationError, OutputError
 from uwlts.fitting.local_surface import SurfacePoints, surface_normals
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
@@ -230,9 +230,9 @@ def test_noise_makes_no_walls(monkeypatch):
         np.zeros(count, int),
     )
     found = SurfacePoints(points, normals, *rest)
-    assert _thinnest_wall(found, 0.7) == np.inf
+    assert _measure_walls(found, 0.7) == np.inf
     monkeypatch.setattr(surface_mesh, "_RESOLVED", 0.0)
-    assert _thinnest_wall(found, 0.7) < 0.1
+    assert _measure_walls(found, 0.7) < 0.1
 
 
 def test_the_thinnest_wall_is_that_of_opposite_normals():
@@ -243,9 +243,9 @@ def test_the_thinnest_wall_is_that_of_opposite_normals():
     points = np.column_stack([flat, np.where(upper, 0.0, -1.5)]) @ turn.T
     up = np.where(upper, 1.0, -1.0)[:, None] * turn[:, 2]
     rest = np.ones(3000), np.zeros(3000), np.zeros(3000), np.zeros(3000, int), np.zeros((0, 3000)), np.zeros(3000, int)
-    assert _thinnest_wall(SurfacePoints(points, up, *rest), 2.0) == pytest.approx(1.5)
-    assert _thinnest_wall(SurfacePoints(points, -up, *rest), 2.0) == np.inf
-    assert _thinnest_wall(SurfacePoints(points, up, *rest), 1.4) == np.inf
+    assert _measure_walls(SurfacePoints(points, up, *rest), 2.0) == pytest.approx(1.5)
+    assert _measure_walls(SurfacePoints(points, -up, *rest), 2.0) == np.inf
+    assert _measure_walls(SurfacePoints(points, up, *rest), 1.4) == np.inf
 
 
 def test_triangles_face_outwards_and_small_pieces_go():
