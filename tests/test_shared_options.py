@@ -26,7 +26,6 @@ MEANING = {
         "--cloud": "[Cc]loud",
         "--capture": "Capture|Scan",
         "--coloured": "write the (cloud coloured|points in the colours)",
-        "--datum": "Cloud of another face",
         "--distortion": "Distortion coefficients to estimate",
         "--folder": "Folder",
         "--home": "Home the stage first",

@@ -26,7 +26,6 @@ from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import CLOUD_ENDINGS, is_readable_cloud, read_cloud
 from uwlts.storage.figure_table import FORMAT as FIGURES, FigureTable, read_figures
 from uwlts.storage.hdf5_file import read_format
-from uwlts.storage.mesh_file import READ_FORMATS as MESH_FORMATS, SurfaceMesh, has_faces, read_mesh
 from uwlts.storage.mount_files import read_mount
 from uwlts.storage.number_tables import Unit
 from uwlts.storage.pose_files import SAVED_FORMAT, PoseFormat, holds_trajectory, read_trajectory
@@ -34,7 +33,7 @@ from uwlts.storage.truth import FORMAT as TRUTH, Truth, TruthHeader, TruthStatus
 
 _TABLES = (".csv", ".txt", ".asc")  # endings of text with a cloud or a trajectory
 _Stored = AnyCalibration | Mount | Evaluation | FigureTable
-_Readable = Capture | PointCloud | SurfaceMesh | Truth | Trajectory | _Stored
+_Readable = Capture | PointCloud | Truth | Trajectory | _Stored
 _JSON_READERS: dict[str, Callable[[Path], _Stored]] = {
     CALIBRATION: load_calibration,
     POLYNOMIALS_FORMAT: load_calibration,
@@ -43,7 +42,7 @@ _JSON_READERS: dict[str, Callable[[Path], _Stored]] = {
     FIGURES: read_figures,
 }
 _READABLE = (
-    f"captures and ground truth (.h5), clouds ({', '.join(CLOUD_ENDINGS)}), meshes ({', '.join(MESH_FORMATS)}), "
+    f"captures and ground truth (.h5), clouds ({', '.join(CLOUD_ENDINGS)}), "
     "calibrations, mounts, figures and evaluations (.json), trajectories (.csv, .tum, ROS bags)"
 )
 
@@ -53,10 +52,9 @@ def read(
 ) -> _Readable:
     """Read a file of the program, whose content determines the type of the result.
 
-    The result is of the class that was saved, or an opened capture. A PLY file with faces is a mesh, text with times
-    and rotations a trajectory. The metadata of a capture's frames are read at once, and images on demand:
-    ``capture[12]`` is a `Frame`. A recording in progress can be opened by its name ``NAME.part``. Close a capture, or
-    use it as a context manager.
+    The result is of the class that was saved, or an opened capture. Text with times and rotations is a trajectory.
+    The metadata of a capture's frames are read at once, and images on demand: ``capture[12]`` is a `Frame`. A recording
+    in progress can be opened by its name ``NAME.part``. Close a capture, or use it as a context manager.
 
     Parameters
     ----------
@@ -71,7 +69,7 @@ def read(
 
     Returns
     -------
-    Capture, PointCloud, SurfaceMesh, Truth, Mount, Evaluation, FigureTable, Trajectory or a calibration
+    Capture, PointCloud, Truth, Mount, Evaluation, FigureTable, Trajectory or a calibration
         An opened capture must be closed, or used in a ``with`` statement.
 
     Raises
@@ -100,8 +98,6 @@ def read(
         return reader(path)
     if ending.lower() in _TABLES and (pose_format != SAVED_FORMAT or holds_trajectory(path)):
         return read_trajectory(path, pose_format=pose_format, unit=pose_unit)
-    if ending.lower() in MESH_FORMATS and (ending.lower() != ".ply" or has_faces(path)):
-        return read_mesh(path, unit=unit)
     if is_readable_cloud(path):
         return read_cloud(path, unit=unit)
     if ending == ".h5":
@@ -193,8 +189,6 @@ def _describe_content(found: object) -> list[str]:
             return cloud_lines(found)
         case Trajectory():
             return trajectory_lines(found)
-        case SurfaceMesh():
-            return found.lines()
         case _:
             return repr(found).splitlines()
 
