@@ -10,7 +10,6 @@ from typing import Self
 
 import numpy as np
 
-from uwlts.desk.server import DeskServer
 from uwlts.desk.shown_state import Board, FrameProfile, Picture
 from uwlts.errors import CaptureError
 from uwlts.model.calibration import AnyCalibration
@@ -169,6 +168,9 @@ def watch(
     CaptureError, CalibrationError
         The finished capture is damaged; the calibration cannot be read, or does not fit the capture.
     """
+    # The server takes a second to import, which a scan without a page does not need.
+    from uwlts.desk.server import DeskServer
+
     path, count = Path(capture), 0
     known = None if calibration is None else resolve_calibration(calibration)
     board = Board(path.name)

@@ -24,10 +24,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.joint.stored_estimate import require_joint
-from uwlts.desk.guided_screen import Ended
 from uwlts.desk.recording_view import LOOK_S, BackgroundView, follow_frames
-from uwlts.desk.shown_state import FrameProfile
+from uwlts.desk.shown_state import Ended, FrameProfile
 from uwlts.errors import CalibrationError, DescriptionError, Error, HardwareError, SetupError
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.camera_interface import CameraDevice
@@ -37,7 +35,6 @@ from uwlts.hardware.scan_plan import ScanPlan, load_plan
 from uwlts.hardware.scanning import ScanProgress, open_camera, record_scan
 from uwlts.model.calibration import AnyCalibration, Calibration, rigid_transform
 from uwlts.optics.fitness import check_fits
-from uwlts.recalibration.recalibrate import KnownPasses
 from uwlts.runtime.optional_library import pip_install
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.calibration_file import load_calibration, resolve_calibration
@@ -214,6 +211,9 @@ class PassAdvice:
     """
 
     def __init__(self, calibration: AnyCalibration, *, pose_std_mm: float | None, pose_std_deg: float | None):
+        from uwlts.calibration.joint.stored_estimate import require_joint
+        from uwlts.recalibration.recalibrate import KnownPasses
+
         if not isinstance(calibration, Calibration):
             raise CalibrationError("advice on passes needs a joint calibration, not one by polynomials")
         require_joint(calibration)
