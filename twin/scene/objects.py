@@ -235,16 +235,15 @@ def _triangulate(thing: AnyObject) -> tuple[np.ndarray, ...] | None:
             return bowed_plate(*thing.bounds_mm(), bow_mm=thing.bow_mm)
         case Block() if thing.edge_radius_mm > 0:
             return rounded_box(np.array(thing.size_mm), radius_mm=thing.edge_radius_mm)
-        case Block() if rough:
+        case Block() | Ball() if rough:
             import trimesh
 
-            box = trimesh.creation.box(thing.size_mm)
-            return box.vertices, box.faces
-        case Ball() if rough:
-            import trimesh
-
-            ball = trimesh.creation.icosphere(subdivisions=5, radius=thing.diameter_mm / 2)
-            return ball.vertices, ball.faces
+            match thing:
+                case Ball():
+                    solid = trimesh.creation.icosphere(subdivisions=5, radius=thing.diameter_mm / 2)
+                case Block():
+                    solid = trimesh.creation.box(thing.size_mm)
+            return solid.vertices, solid.faces
         case Pipe() if rough:
             around = np.linspace(0, 2 * np.pi, 360, endpoint=False)
             return tube(np.array([-0.5, 0.5]) * thing.length_mm, around, np.full((2, 360), thing.diameter_mm / 2))
