@@ -11,7 +11,6 @@ from .doctor import examine as examine
 from .errors import Error as Error
 from .evaluation.evaluate import Evaluation as Evaluation, evaluate as evaluate
 from .inspection.features import Inspection as Inspection
-from .inspection.flat import inspect_flange as inspect_flange, inspect_gap as inspect_gap, inspect_step as inspect_step
 from .inspection.pipe import inspect_pipe as inspect_pipe
 from .inspection.weld import inspect_weld as inspect_weld
 from .model.calibration import Calibration as Calibration, PolynomialCalibration as PolynomialCalibration

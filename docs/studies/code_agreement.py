@@ -109,13 +109,11 @@ JOBS: dict[str, str] = {
         uwlts verify inputs/scans/step-scan.h5 {TAKEN}""",
     "clouds": "\n".join(
         f"uwlts reconstruct inputs/scans/{name}.h5 {TAKEN} --out clouds/{name}.full.ply"
-        for name in ("pipe", "pipe-later", "weld", "flange", "shapes", "shapes-again")
+        for name in ("pipe", "pipe-later", "weld", "shapes", "shapes-again")
     ),
     "inspect": """
         uwlts inspect clouds/pipe.full.ply --wall-mm 9.5 --out inspect/pipe.json --coloured inspect/pipe.full.ply
         uwlts inspect clouds/weld.full.ply weld --out inspect/weld.json
-        uwlts inspect clouds/flange.full.ply flange --out inspect/flange.json
-        uwlts inspect reconstruct/step.full.ply step --out inspect/step.json
         uwlts findings-report clouds/pipe.full.ply --captures inputs/scans/pipe.h5 \
             --calibration joint/calibration.json --certificate certificate/certificate.json \
             --verification evaluate/spheres.json --out inspect/report.html""",

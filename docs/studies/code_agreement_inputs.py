@@ -70,7 +70,6 @@ RECORDINGS: dict[str, dict[str, Any]] = {
     "pipe": {"scene": "pitted-pipe", "placements": ["standoff"], "motion": PIPE},
     "pipe-later": {"scene": "pipe-later.toml", "placements": ["standoff"], "motion": PIPE | {"start_mm": -19.5}},
     "weld": {"scene": "weld.toml", "placements": ["standoff"]},
-    "flange": {"scene": "flange", "placements": ["standoff"]},
     "shapes": {"scene": "shapes"},
     "shapes-again": {"scene": "shapes", "motion": {"start_mm": -16.5}},
     "robot-sphere": {"scene": "robot-sphere"},

@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 
 import uwlts
 from twin.scene.description import load_scene
-from twin.scene.forms import Flange, Weld
+from twin.scene.forms import Weld
 from twin.scene.forms.parts import weld_height
 from uwlts.inspection.features import Feature, FeatureKind, Inspection
 from uwlts.storage.capture_writer import CaptureWriter
@@ -39,18 +39,7 @@ HOLLOWS = FeatureKind.PIT, FeatureKind.DENT
 BLEMISHES = *HOLLOWS, FeatureKind.PROTRUSION
 HEAD = ["of", "value", "number", "spread", "truth within the 95 % interval"]
 DRAWS = 0, 5
-SHOWN = (
-    "depth",
-    "length",
-    "lost area",
-    "diameter",
-    "ovality",
-    "height",
-    "width",
-    "largest undercut",
-    "flatness",
-    "position",
-)
+SHOWN = ("depth", "length", "lost area", "diameter", "ovality", "height", "width", "largest undercut")
 """Values in the table."""
 PICTURE = Path(__file__).parents[1] / "pictures" / "inspection-pits.png"
 Pairs = list[tuple[Feature, dict[str, float]]]
@@ -180,7 +169,7 @@ def pits_in(folder: Path, water: str, draw: int) -> dict[str, Pairs]:
 
 
 def wholes_in(folder: Path, water: str) -> dict[str, Pairs]:
-    """Return found and true values of the pipe from six sides, of welds, and of the flange with its holes."""
+    """Return found and true values of the pipe from six sides, and of welds."""
     pipe = uwlts.inspect_pipe(around(folder, water))
     truth = {"diameter": DIAMETER_MM, "ovality": DIAMETER_MM * OVALITY}
     pairs: dict[str, Pairs] = {"pipe from six sides": [(pipe.features[0], truth)], "welds": []}
@@ -189,12 +178,7 @@ def wholes_in(folder: Path, water: str) -> dict[str, Pairs]:
         assert isinstance(weld, Weld)
         found = uwlts.inspect_weld(cloud_of(folder, water, path.stem.removesuffix(f"-{water}")))
         pairs["welds"].append((found.features[0], true_weld(weld)))
-    scene = load_scene(str(folder / f"flange-{water}.toml")).objects[0]
-    assert isinstance(scene, Flange)
-    found = uwlts.inspect_flange(cloud_of(folder, "flanges", f"flange-{water}"))
-    truth = {"flatness": scene.flatness_mm, "bore": scene.bore_diameter_mm, "bolt circle": scene.bolt_circle_mm}
-    holes = [(hole, {"diameter": scene.hole_diameter_mm, "position": 0.0}) for hole in found.select(FeatureKind.HOLE)]
-    return pairs | {"flange": [(found.features[0], truth)], "holes of the flange": holes}
+    return pairs
 
 
 def unchanged_rows(folder: Path, water: str, draw: int) -> list[list[str]]:

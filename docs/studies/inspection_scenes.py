@@ -1,6 +1,6 @@
 """Objects of known shape for the study of inspections, as meshes and scenes, and the campaigns that render them.
 
-The objects are a pipe of 300 mm diameter and 0.5 % ovality, welds, a flange, and a thin plate seen from both sides. The
+The objects are a pipe of 300 mm diameter and 0.5 % ovality, welds, and a thin plate seen from both sides. The
 pipe is smooth, has a grid of small pits, or has large pits; one is seen from six sides. All surfaces are known in
 closed form (`radius_mm`).
 """
@@ -147,20 +147,6 @@ def record(folder: Path, draw: int) -> None:
         recordings = [{"name": name, "scene": f"{name}-{water}.toml"} for name in names]
         campaign = {"base": "thesis", "title": f"inspection, {water}", "recordings": recordings}
         (folder / f"{water}.toml").write_text(tomli_w.dumps(campaign), encoding="utf-8")
-    flange = {
-        "kind": "flange",
-        "outer_diameter_mm": 150.0,
-        "bore_diameter_mm": 60.0,
-        "bolt_circle_mm": 110.0,
-        "holes": 6,
-    }
-    flange |= {"hole_diameter_mm": 14.0, "first_hole_deg": 10.0, "flatness_mm": 0.1, "reflectance": 0.4}
-    scene = _scene("Flange", flange, {"start_mm": -75.0, "step_mm": 1.5, "count": 101})
-    for water in WATERS:
-        (folder / f"flange-{water}.toml").write_text(tomli_w.dumps({"water": water} | scene), encoding="utf-8")
-    recordings = [{"name": f"flange-{water}", "scene": f"flange-{water}.toml"} for water in WATERS]
-    campaign = {"base": "thesis", "title": "inspection, flanges", "recordings": recordings}
-    (folder / "flanges.toml").write_text(tomli_w.dumps(campaign), encoding="utf-8")
     axial = {"direction": [0.0, 0.0, 1.0], "start_mm": -126.0, "step_mm": 17.6, "count": 12}
     calibration = [
         {"name": "target-bare", "scene": "target", "motion": {"step_mm": 18.0, "count": 16}},
@@ -172,7 +158,7 @@ def record(folder: Path, draw: int) -> None:
     campaign = {"base": "thesis", "title": "inspection, calibration", "recordings": calibration}
     (folder / "calibration.toml").write_text(tomli_w.dumps(campaign), encoding="utf-8")
     write_plate(folder)
-    for name in ("calibration", *WATERS, "flanges", "plate"):
+    for name in ("calibration", *WATERS, "plate"):
         twin.record(folder / f"{name}.toml", out=folder / name, seed=draw)
     if not (path := folder / "calibration" / "calibration.json").exists():
         views = {name: [folder / "calibration" / f"target-{name}.h5"] for name in ("bare", "air", "water")}

@@ -39,7 +39,6 @@ RECORDINGS: list[dict[str, Any]] = [
     {"name": "spheres-near", "scene": "spheres.toml", "placements": ["near"]},
     {"name": "spheres-far", "scene": "spheres.toml", "placements": ["far"]},
     {"name": "step-scan", "scene": "step-scan", "motion": {"step_mm": 2.0, "count": 11}},
-    {"name": "plane", "scene": "plane", "motion": {"start_mm": -30.0, "step_mm": 6.0, "count": 11}},
     {"name": "pipe-around", "scene": "pipe-around"},
     {"name": "pits", "scene": "pits.toml", "motion": {"start_mm": -24.0, "step_mm": 1.0, "count": 49}},
     {"name": "undercut", "scene": "undercut", "motion": {"step_mm": 2.0, "count": 13}},
@@ -160,7 +159,7 @@ def figure_of(name: str, scan: str) -> str:
     """Return the kind of a figure."""
     if name.startswith("diameter error"):
         return "pipe diameter, five sides" if scan == "pipe-around" else "sphere diameter"
-    kinds = {"SSE": "sphere spacing", "height": "step height", "flatness": "flatness of the plane"}
+    kinds = {"SSE": "sphere spacing", "height": "step height"}
     kinds |= {"ovality": "ovality of the pipe", "depth": f"depth of {scan}"}
     return next(words for start, words in kinds.items() if name.startswith(start))
 

@@ -106,7 +106,7 @@ def draw_sensor(sensor: Sensor, rng: np.random.Generator) -> Sensor:
 
 
 def draw_scene(rng: np.random.Generator, kind: int) -> list[dict[str, object]]:
-    """Return objects of one of five kinds: sea floor, corroded pipe, flange, weld, and rubble of shapes."""
+    """Return objects of one of five kinds: sea floor, corroded pipe, crossing pipes, weld, and rubble of shapes."""
     seed, turn = int(rng.integers(2**31)), float(rng.uniform(-20, 20))
     match kind:
         case 0:
@@ -127,9 +127,9 @@ def draw_scene(rng: np.random.Generator, kind: int) -> list[dict[str, object]]:
             }
             return [pipe | {"reflectance": 0.4}]
         case 2:
-            flange = {"kind": "flange", "outer_diameter_mm": 165.0, "bore_diameter_mm": 62.0, "thickness_mm": 18.0}
-            flange |= {"bolt_circle_mm": 125.0, "holes": 4, "hole_diameter_mm": 18.0, "bolts": 2, "flatness_mm": 0.2}
-            return [flange | {"reflectance": 0.4, "rotation_deg": [turn, 10.0, 0.0]}]
+            pipe = {"kind": "pipe", "length_mm": 180.0, "position_mm": [0.0, 0.0, 50.0], "reflectance": 0.4}
+            turns = {90.0: [0.0, 0.0, turn], 60.0: [0.0, 0.0, turn + 90.0]}
+            return [pipe | {"diameter_mm": size, "rotation_deg": angles} for size, angles in turns.items()]
         case 3:
             weld = {"kind": "weld", "plate_mm": [120.0, 160.0], "beads": 3, "spacing_mm": 30.0, "along": "x"}
             weld |= {"length_mm": 110.0, "width_mm": 14.0, "height_mm": 4.0, "ripple_pitch_mm": 8.0}

@@ -1,6 +1,6 @@
 """Meshes of the rendered scans of `inspection.py` against their true surfaces.
 
-Errors are those of the vertices, along the normal, against the closed form of a corroded pipe, of a flange's face, and
+Errors are those of the vertices, along the normal, against the closed form of a corroded pipe, and
 of both sides of a thin plate.
 """
 
@@ -13,9 +13,6 @@ from scipy.spatial import KDTree
 from thin_wall import SIDES, off_plate, side_cloud
 
 import uwlts
-from twin.scene.description import load_scene
-from twin.scene.forms import Flange
-from twin.scene.forms.parts import flange_face
 
 SEEN_MM = 1.0
 """Largest distance from a vertex to the nearest point; beyond it, the surface was not seen."""
@@ -34,17 +31,6 @@ def off_pipe(points: np.ndarray) -> np.ndarray:
     return (away - radius()) / np.sqrt(1 + slopes[0] ** 2 + slopes[1] ** 2)
 
 
-def off_flange(folder: Path, water: str):
-    """Return a function for distances from a flange's face; they are NaN beside the face."""
-    flange = load_scene(str(folder / f"flange-{water}.toml")).objects[0]
-    assert isinstance(flange, Flange)
-
-    def off(points: np.ndarray) -> np.ndarray:
-        return flange_face(flange, points[:, 0], points[:, 1]) - points[:, 2]
-
-    return off
-
-
 def row(name: str, made: uwlts.SurfaceMesh, off: np.ndarray, points: np.ndarray) -> list[str]:
     """Return a row of the table: errors (N,) of the vertices, coverage, and vertices on surfaces that were not seen."""
     beyond = KDTree(points).query(made.vertices_mm)[0] > SEEN_MM
@@ -59,12 +45,9 @@ def mesh_table(folder: Path) -> str:
     """Return the table of meshes of a folder with recordings."""
     rows = []
     for water in WATERS:
-        for name, cloud, off in (
-            ("corroded pipe", cloud_of(folder, water, "pipe-corroded"), off_pipe),
-            ("flange", cloud_of(folder, "flanges", f"flange-{water}"), off_flange(folder, water)),
-        ):
-            made = uwlts.mesh(cloud)
-            rows.append(row(f"{name}, {water}", made, 1e3 * off(made.vertices_mm), cloud.points_mm))
+        cloud = cloud_of(folder, water, "pipe-corroded")
+        made = uwlts.mesh(cloud)
+        rows.append(row(f"corroded pipe, {water}", made, 1e3 * off_pipe(made.vertices_mm), cloud.points_mm))
     clouds = [side_cloud(folder, side) for side in SIDES]
     made = uwlts.mesh(*clouds, towards=[[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
     points = np.concatenate([cloud.points_mm for cloud in clouds])

@@ -15,7 +15,7 @@ import pytest
 from tests import preloaded
 from tests.system.test_desk import SLOW_MS, press, says, tab, watched
 from tests.system.test_desk_analyses import choose
-from tests.uwlts.desk.test_analyses import HEIGHT_MM, NOISE_MM, step_cloud
+from tests.uwlts.desk.test_analyses import HEIGHT_MM, NOISE_MM, step_cloud, weld_cloud
 from uwlts.storage.cloud import PointUncertainty
 
 if TYPE_CHECKING:
@@ -148,14 +148,15 @@ def test_values_are_measured_limited_undone_and_saved(page, place):
     tab(page, "Measure")
     page.wait_for_function("document.querySelectorAll('[aria-label=\"name\"]')[0].value === 'plate, across'")
     # The list appears in the report of an inspection.
+    weld_cloud().save(place / "weld.ply")
     tab(page, "Inspect")
-    choose(page, "analysis", "inspect step")
-    choose(page, "cloud", "plate.cloud.h5")
+    choose(page, "analysis", "inspect weld")
+    choose(page, "cloud", "weld.ply")
     choose(page, "measured values", "plate.measured.json")
     press(page, "analyse")
-    says(page, "wrote plate-step.html")
-    assert "plate, across" in (place / "plate-step.html").read_text(encoding="utf-8")
-    record = json.loads((place / "plate-step.findings.json").read_text(encoding="utf-8"))
+    says(page, "wrote weld-weld.html")
+    assert "plate, across" in (place / "weld-weld.html").read_text(encoding="utf-8")
+    record = json.loads((place / "weld-weld.findings.json").read_text(encoding="utf-8"))
     assert [each["name"] for each in record["measured"]] == ["plate, across", "step 1"]
 
 

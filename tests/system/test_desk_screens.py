@@ -23,7 +23,7 @@ from tests.system.test_desk import (
     tab,
 )
 from tests.system.test_desk_analyses import choose
-from tests.uwlts.desk.test_analyses import step_cloud
+from tests.uwlts.desk.test_analyses import step_cloud, weld_cloud
 from tests.waiting import within
 
 if TYPE_CHECKING:
@@ -122,9 +122,9 @@ port = "{port}"
 """
 
 
-def write_large_step(path: Path) -> None:
+def write_large_weld(path: Path) -> None:
     """Write a cloud whose inspection takes a while."""
-    cloud = step_cloud()
+    cloud = weld_cloud()
     shifts = [(x, y, 0.0) for x in np.arange(0, 1, 0.1) for y in np.arange(0, 1, 0.1)]
     points = np.concatenate([cloud.points_mm + shift for shift in shifts])
     columns = {name: np.tile(getattr(cloud, name), len(shifts)) for name in ("intensity", "frame", "line")}
@@ -160,7 +160,7 @@ def test_laser_off_works_in_every_phase(desk, sized: "Page", served: "ServedTwin
     """Judged by the controller's light; in homing, when the laser cannot be on, by the controller's state."""
     page, folder, firmware = sized, desk.folder, served.controller._firmware
     off = LaserOff(page, served)
-    write_large_step(folder / "plate.ply")
+    write_large_weld(folder / "plate.ply")
     text = GUIDED.format(camera=served.camera.address, port=served.controller.port)
     (folder / "guided.toml").write_text(text, encoding="utf-8")
     press(page, "connect")
@@ -196,12 +196,12 @@ def test_laser_off_works_in_every_phase(desk, sized: "Page", served: "ServedTwin
     off.works("paused")
     unlock(page)
     tab(page, "Inspect")
-    choose(page, "analysis", "inspect step")
+    choose(page, "analysis", "inspect weld")
     choose(page, "cloud", "plate.ply")
     press(page, "analyse")
-    page.get_by_text(re.compile(r"inspect step: plate.ply, \d+ s")).wait_for()
+    page.get_by_text(re.compile(r"inspect weld: plate.ply, \d+ s")).wait_for()
     off.works("analysis")
-    assert page.get_by_text(re.compile(r"inspect step: plate.ply, \d+ s")).is_visible()
+    assert page.get_by_text(re.compile(r"inspect weld: plate.ply, \d+ s")).is_visible()
     press(page, "cancel")
     page.get_by_role("alert").get_by_text("cancelled").wait_for()
     # A plot, and a note about an error.

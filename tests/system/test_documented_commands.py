@@ -36,14 +36,12 @@ twin simulate spheres --placement standoff --seed 1 --as-built thesis-as-built -
 twin simulate pipe --as-built thesis-as-built --out pipe.h5
 twin simulate plane --as-built thesis-as-built --out plane.h5
 twin simulate weld --as-built thesis-as-built --out weld.h5
-twin simulate flange --as-built thesis-as-built --out flange.h5
 twin simulate step-scan --as-built thesis-as-built --out step-scan.h5
 uwlts calibrate --air target-air.h5 --water target-water.h5 --step step-near.h5 step-far.h5 --out calibration.json
 uwlts certificate calibration.json --out certificate.html
 uwlts reconstruct spheres.h5 --calibration calibration.json --out spheres.cloud.h5
 uwlts reconstruct pipe.h5 --calibration calibration.json --out pipe.cloud.h5
 uwlts reconstruct weld.h5 --calibration calibration.json --out weld.cloud.h5
-uwlts reconstruct flange.h5 --calibration calibration.json --out flange.cloud.h5
 uwlts reconstruct step-scan.h5 --calibration calibration.json --out step-scan.cloud.h5
 uwlts mesh pipe.cloud.h5 --out pipe.stl
 """
@@ -57,24 +55,6 @@ NEEDS_ROS = "needs ROS 2: tests/ros_node.py runs it"
 
 THREE_VIEWS = {"top.cloud.h5": "pipe.cloud.h5"} | {f"{side}.cloud.h5": f"{side}.cloud.h5" for side in ("left", "right")}
 NO_MOVEMENT = "1,0,0,0,0,1,0,0,0,0,1,0\n" * 3
-PLATES = """
-title = "Two plates with a gap of 3 mm along the scan"
-medium = "water"
-[motion]
-start_mm = -11.0
-step_mm = 2.0
-count = 12
-[[objects]]
-kind = "plate"
-width_mm = 100.0
-height_mm = 50.0
-position_mm = [0.0, 26.5, 0.0]
-[[objects]]
-kind = "plate"
-width_mm = 100.0
-height_mm = 50.0
-position_mm = [0.0, -26.5, 0.0]
-"""
 ROBOT = """
 twin simulate robot-sphere --out robot.h5
 uwlts nominal thesis --medium water --out calibration.json
@@ -244,15 +224,8 @@ PAGES_RUN = {
         },
     ),
     "docs/how-to/inspect-a-pipe.md": Page(
-        given={name: name for name in ("pipe.cloud.h5", "pipe.h5", "weld.cloud.h5", "flange.cloud.h5")}
-        | {"other-flange.cloud.h5": "flange.cloud.h5", "plate.cloud.h5": "step-scan.cloud.h5"}
-        | {"water.json": "calibration.json", "water.certificate.json": "certificate.json"},
-        texts={"gap.toml": PLATES},
-        before="""
-            twin simulate gap.toml --out plates.h5
-            uwlts nominal thesis --medium water --out nominal.json
-            uwlts reconstruct plates.h5 --calibration nominal.json --out plates.cloud.h5
-        """,
+        given={name: name for name in ("pipe.cloud.h5", "pipe.h5", "weld.cloud.h5")}
+        | {"water.json": "calibration.json", "water.certificate.json": "certificate.json"}
     ),
     "docs/how-to/large-clouds.md": Page(
         given={"scan.cloud.h5": "pipe.cloud.h5"}, instead={"1000 -50 300 1100 50 600": "-10 -50 0 10 50 30"}

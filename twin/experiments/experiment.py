@@ -9,7 +9,7 @@ import tomli_w
 
 from twin.experiments.figures import describe_conditions, load_published, read_figures, read_flaws
 from twin.experiments.result import ExperimentResult
-from twin.experiments.runner import COLOURED, Method, evidence_of, inspected_as, is_evaluated, plan_lines, run_stages
+from twin.experiments.runner import COLOURED, Method, evidence_of, inspected_as, plan_lines, run_stages
 from twin.recording.campaigns import RecordingOptions, make_folder, record_campaigns, require_at_least
 from twin.rendering_options import CPU, Variant
 from twin.scene.campaign import Campaign, find_understated, list_takes, load_campaign
@@ -261,7 +261,7 @@ def choose_joint(campaign: Campaign, every: int, *, with_truth: bool) -> Method:
     for take in list_takes(campaign, seed=0, every=every):
         if (option := evidence_of(take)) is not None:
             evidence[option].append(take.name)
-        elif with_truth or is_evaluated(take.scene) or inspected_as(take.scene) is not None:
+        elif with_truth or take.scene.artefact is not None or inspected_as(take.scene) is not None:
             scans.append(take.name)
     if not evidence["air"] and not evidence["water"]:
         raise DescriptionError(f"campaign {campaign.title!r} has no recording of a target for the calibration")

@@ -108,20 +108,14 @@ def calibrated_values(scene: Scene) -> dict[str, tuple[float, float]]:
 
 
 def _read_values(method: Method, folder: Path, take: Take) -> Iterator[dict[str, Any]]:
-    """Yield the flatness of an inspected plane, or diameter and ovality of a pipe if both were measured."""
-    match inspected_as(take.scene) if method.inspected else None:
-        case "flange":
-            plane = parse_artefact(take.scene.artefact)
-            assert isinstance(plane, PlaneStandard)
-            truth = {"flatness": plane.flatness_mm or 0.0}
-        case "pipe":
-            pipe = next(thing for thing in take.scene.objects if isinstance(thing, PittedPipe))
-            truth = {"diameter": pipe.diameter_mm, "ovality": pipe.diameter_mm * pipe.ovality}
-        case _:
-            return
+    """Yield diameter and ovality of an inspected pipe if both were measured."""
+    if not method.inspected or inspected_as(take.scene) != "pipe":
+        return
+    pipe = next(thing for thing in take.scene.objects if isinstance(thing, PittedPipe))
+    truth = {"diameter": pipe.diameter_mm, "ovality": pipe.diameter_mm * pipe.ovality}
     whole = read_inspection(method, folder, take)["features"][0]["values"]
     # Without an ovality, the interval of a diameter is that of an assumed largest ovality.
-    for name, true in truth.items() if "ovality" in whole or "flatness" in truth else ():
+    for name, true in truth.items() if "ovality" in whole else ():
         value = whole[name]
         expanded = 2 * math.hypot(value["random"], value["systematic"] or 0.0)
         yield {"figure": f"{name} error", "true_mm": true, "measured_mm": value["value"], "expanded_mm": expanded}

@@ -30,7 +30,7 @@ COLOURED = "coloured.ply"  # end of the names of clouds with the colours of thei
 
 THESIS = "thesis"  # begin of the name of a file with figures of `uwlts thesis`
 
-Inspected = Literal["flange", "pipe", "weld"]  # kind of object for `uwlts inspect`; a plane is the face of a flange
+Inspected = Literal["pipe", "weld"]  # kind of object for `uwlts inspect`
 
 
 @dataclass(frozen=True)
@@ -106,15 +106,8 @@ def evidence_of(take: Take) -> str | None:
 
 def inspected_as(scene: Scene) -> Inspected | None:
     """Return the kind of object for the inspection of a scene; None if it is not inspected."""
-    if (scene.artefact or {}).get("kind") == "plane":
-        return "flange"
     kinds: dict[type, Inspected] = {PittedPipe: "pipe", Weld: "weld"}
     return next((kind for thing in scene.objects for of, kind in kinds.items() if isinstance(thing, of)), None)
-
-
-def is_evaluated(scene: Scene) -> bool:
-    """Return whether a scene shows an artefact with a calibrated size."""
-    return (scene.artefact or {}).get("kind") not in (None, "plane")
 
 
 def plan_lines(
@@ -138,7 +131,7 @@ def plan_lines(
             capture, cloud = folder / f"{scan}.h5", method.result(folder, scan, "cloud.h5")
             arguments = (capture, "--calibration", calibration, "--out", cloud, *shlex.split(method.detection))
             lines[cloud] = _line("reconstruct", cloud, "reconstruct", *arguments)
-            if method.with_truth or is_evaluated(takes[scan].scene):
+            if method.with_truth or takes[scan].scene.artefact is not None:
                 made = method.result(folder, scan, "evaluation.json")
                 compared = ["--truth", str(capture.with_suffix(".truth.h5"))] if method.with_truth else []
                 if method.with_truth and coloured and method is methods[0]:

@@ -163,7 +163,7 @@ def radiometry(
     say(f"wrote {out} and {out.with_suffix('.json').name}")
 
 
-_INSPECTIONS = [(uwlts, f"inspect_{kind}") for kind in ("pipe", "weld", "flange")]
+_INSPECTIONS = [(uwlts, f"inspect_{kind}") for kind in ("pipe", "weld")]
 """Functions that provide the options of an inspection."""
 
 
@@ -219,13 +219,11 @@ def compare(
     "inspect_pipe",
     job="Inspect",
     also=[*_INSPECTIONS, (uwlts, "export")],
-    summary="Find the features of a pipe, weld, step, flange or gap in a cloud and measure them, with uncertainty.",
+    summary="Find the features of a pipe or weld in a cloud and measure them, with uncertainty.",
 )
 def inspect(
     call: Call,
-    kind: Annotated[
-        Literal["pipe", "weld", "step", "flange", "gap"], Parameter(help="Kind of the object in the cloud.")
-    ] = "pipe",
+    kind: Annotated[Literal["pipe", "weld"], Parameter(help="Kind of the object in the cloud.")] = "pipe",
     *,
     out: Annotated[
         Path | None,
@@ -233,7 +231,6 @@ def inspect(
         Parameter(help="Findings to write (JSON), each value with its definition and its source."),
     ] = None,
     coloured: ColouredOut = None,
-    datum=None,
     unit=None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -243,8 +240,7 @@ def inspect(
     from uwlts.storage.cloud_files import load_cloud
 
     measured = load_cloud(call.given.pop("cloud"), unit=unit)
-    options = call.given if datum is None else call.given | {"datum": load_cloud(datum, unit=unit)}
-    found = inspect_cloud(measured, kind, **options)
+    found = inspect_cloud(measured, kind, **call.given)
     show(found.lines())
     if coloured:
         write_coloured(
@@ -257,9 +253,7 @@ def inspect(
 
 
 @command_from(app, uwlts.report, "write_findings", job="Inspect", also=_INSPECTIONS)
-def findings_report(
-    call: Call, *, section_mm=None, wall_mm=None, false_alarm=None, largest_ovality=None, datum=None
-) -> None:
+def findings_report(call: Call, *, section_mm=None, wall_mm=None, false_alarm=None, largest_ovality=None) -> None:
     """Example: uwlts findings-report pipe.cloud.h5 --wall-mm 9.5 --calibration water.json --out pipe.html --pdf"""
     from uwlts.pages.toolkit import json_beside
 

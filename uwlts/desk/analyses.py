@@ -24,7 +24,6 @@ from uwlts.desk.shown_state import Board
 from uwlts.errors import DescriptionError, Error, OutputError
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.inspection.features import BLEMISHES, Inspection
-from uwlts.inspection.inspect import INSPECTIONS
 from uwlts.report.measured_values import judge_feature, load_order, sort_by_severity
 from uwlts.runtime.command_line import descriptions, option_type
 from uwlts.runtime.progress import ProgressListener
@@ -42,7 +41,6 @@ _FILES: Mapping[str, str] = MappingProxyType(
         "poses": "table",
         "file": "cloud",
         "reference": "cloud",
-        "datum": "cloud",
         "order": "description",
         "measured": "measured values",
     }
@@ -202,18 +200,15 @@ _COMPARED = ("cloud", "reference", "register", "same_water", "cloud_std_mm", "re
 _CLOUD = ".cloud.h5"
 """Ending of clouds to measure, with the whole uncertainty."""
 _INSPECTED = (".html", ".findings.json", "-coloured.ply")
-_OPTIONS = {"pipe": ("wall_mm",), "weld": ("section_mm",), "flange": ("datum",)}
+_OPTIONS = {"pipe": "wall_mm", "weld": "section_mm"}
 ANALYSES: Mapping[str, Analysis] = MappingProxyType(
     {
         "reconstruct": Analysis(_reconstruct, ((uwlts, "reconstruct", ("capture", "calibration")),), "", (_CLOUD,)),
         **{
             f"inspect {kind}": Analysis(
-                _inspect,
-                ((uwlts, f"inspect_{kind}", ("cloud", *_OPTIONS.get(kind, ()))), _REPORT),
-                f"-{kind}",
-                _INSPECTED,
+                _inspect, ((uwlts, f"inspect_{kind}", ("cloud", option)), _REPORT), f"-{kind}", _INSPECTED
             )
-            for kind in INSPECTIONS
+            for kind, option in _OPTIONS.items()
         },
         "compare": Analysis(
             _compare,

@@ -37,10 +37,6 @@ class FeatureKind(StrEnum):
     DENT = "dent"
     PROTRUSION = "protrusion"
     WELD = "weld"
-    STEP = "step"
-    FLANGE = "flange"
-    HOLE = "hole"
-    GAP = "gap"
 
 
 BLEMISHES = (FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION)
@@ -117,25 +113,6 @@ DEFINITIONS: dict[FeatureKind, dict[str, Definition]] = {
         ),
         "toe angle right": Definition("deg", "the same at the right toe", "ISO 5817, 505"),
         "misalignment": Definition("mm", "offset of the plates in the middle of the weld", "ISO 5817, 507"),
-    },
-    FeatureKind.STEP: {
-        "height": Definition("mm", "distance of the upper face from the lower one's plane", "ISO 5436-1, type A"),
-        "parallelism": Definition("deg", "angle between both faces", "ISO 1101"),
-    },
-    FeatureKind.FLANGE: {
-        "flatness": Definition("mm", "range of the smoothed face about its least-squares plane", "ISO 12781-1, FLTt"),
-        "bolt circle": Definition("mm", "diameter of the circle through the holes' centres", "ASME B16.5"),
-        "bore": Definition("mm", "diameter of the face's inner edge", "ASME B16.5"),
-        "parallelism": Definition("deg", "angle between the face and the datum that was given", "ISO 1101"),
-    },
-    FeatureKind.HOLE: {
-        "diameter": Definition("mm", "diameter of the circle through the edge", _GAUSSIAN),
-        "position": Definition("mm", "distance of the centre from its place on an even bolt circle", "ISO 5458"),
-    },
-    FeatureKind.GAP: {
-        "width": Definition("mm", "mean distance of the two edges", "VDA gap and flush"),
-        "parallelism": Definition("deg", "angle between the two edges", "ISO 1101"),
-        "flush": Definition("mm", "offset of the two faces in the middle of the gap", "VDA gap and flush"),
     },
 }
 """Definitions of all values by kind of feature and name."""
@@ -297,7 +274,7 @@ class Inspection(Brief):
     Attributes
     ----------
     kind : str
-        Kind of object: "pipe", "weld", "step", "flange" or "gap".
+        Kind of object: "pipe" or "weld".
     features : tuple of Feature
         The whole object first, then its parts.
     deviation_mm : (N,) float64
@@ -370,17 +347,11 @@ def plain_value(
 
 
 def linear_value(
-    kind: FeatureKind,
-    name: str,
-    value: float,
-    covariances: tuple[np.ndarray, np.ndarray | None],
-    by: np.ndarray,
-    *,
-    least: float = -np.inf,
+    kind: FeatureKind, name: str, value: float, covariances: tuple[np.ndarray, np.ndarray | None], by: np.ndarray
 ) -> FeatureValue:
     """Return a value with derivatives ``by`` (K,) by parameters, from their covariances (K, K) by `PointErrors`."""
     random, common = (None if each is None else float(np.sqrt(by @ each @ by)) for each in covariances)
-    return plain_value(kind, name, value, random or 0.0, common, least=least)
+    return plain_value(kind, name, value, random or 0.0, common)
 
 
 def amplitude_value(

@@ -7,19 +7,12 @@ from typing import Literal
 
 from uwlts.errors import EvaluationError
 from uwlts.inspection.features import Inspection
-from uwlts.inspection.flat import inspect_flange, inspect_gap, inspect_step
 from uwlts.inspection.pipe import inspect_pipe
 from uwlts.inspection.weld import inspect_weld
 from uwlts.storage.cloud import PointCloud
 
-InspectionKind = Literal["pipe", "weld", "step", "flange", "gap"]
-INSPECTIONS: dict[InspectionKind, Callable[..., Inspection]] = {
-    "pipe": inspect_pipe,
-    "weld": inspect_weld,
-    "step": inspect_step,
-    "flange": inspect_flange,
-    "gap": inspect_gap,
-}
+InspectionKind = Literal["pipe", "weld"]
+INSPECTIONS: dict[InspectionKind, Callable[..., Inspection]] = {"pipe": inspect_pipe, "weld": inspect_weld}
 
 
 def inspect_cloud(cloud: PointCloud | str | os.PathLike[str], kind: InspectionKind, **options: object) -> Inspection:

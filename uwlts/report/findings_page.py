@@ -139,12 +139,12 @@ def write_findings(
     overwrite
         Replace existing files.
     **options
-        Options of the inspection: `uwlts.inspect_pipe`, `uwlts.inspect_weld`, `uwlts.inspect_flange`.
+        Options of the inspection: `uwlts.inspect_pipe`, `uwlts.inspect_weld`.
 
     Returns
     -------
     Inspection
-        What the report is about, as from ``uwlts.inspect_pipe`` and its siblings.
+        What the report is about, as from ``uwlts.inspect_pipe`` or ``uwlts.inspect_weld``.
 
     Raises
     ------
@@ -269,8 +269,8 @@ def _render(
     made: datetime,
 ) -> str:
     parts = [each for each in found.features if each.kind in BLEMISHES]
-    whole = [each for each in found.features if each.kind not in (*BLEMISHES, FeatureKind.SECTION, FeatureKind.HOLE)]
-    repeated = [each for each in found.features if each.kind in (FeatureKind.SECTION, FeatureKind.HOLE)]
+    whole = [each for each in found.features if each.kind not in (*BLEMISHES, FeatureKind.SECTION)]
+    repeated = found.select(FeatureKind.SECTION)
     limited = [each for each in whole if judge_feature(each, order.limits)[0] != "no limit"]
     parts, listed = (sort_by_severity(each, order.limits) for each in (parts, [*parts, *limited]))
     drawn = parts[:_MOST_PICTURES]

@@ -1,4 +1,4 @@
-"""Planes, straight lines and circles: orthogonal-distance fits; the largest plane of a cloud."""
+"""Planes, straight lines and circles: orthogonal-distance fits."""
 
 from dataclasses import dataclass
 from typing import Any, Self
@@ -6,13 +6,7 @@ from typing import Any, Self
 import numpy as np
 
 from uwlts.errors import EvaluationError
-from uwlts.fitting.least_squares import Normalised, fit_robustly, normalise_points, robust_std, thin_evenly
-
-_PROPOSALS = 600  # random planes through three points that are tried for the largest one
-_JUDGING_POINTS = 3000  # points, evenly thinned, that compare these planes
-_NEAR = 2e-3
-"""Largest distance of a point from a proposed plane, as a fraction of the cloud's size; the plane is refined then."""
-_REFINEMENTS = 4  # robust fits that refine the largest plane
+from uwlts.fitting.least_squares import Normalised, normalise_points
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,32 +67,6 @@ class Plane(Flat):
         if unit.is_flat(1):
             raise EvaluationError(f"a plane fit: all {len(unit.points)} points lie on one line")
         return cls._make_from_axes(unit, unit.axes[:2], _orient(unit.axes[2], towards)[None])
-
-    @classmethod
-    def find(cls, points: np.ndarray, *, towards: Any, off: float) -> tuple[Self, np.ndarray]:
-        """Find the plane with most points (N, 3), mm; return it with the mask (N,) of its points.
-
-        Random triples propose planes (RANSAC), and robust fits refine the best one. Points belong to it within ``off``
-        robust standard deviations. Errors as for `fit`.
-        """
-        thinned = thin_evenly(points, _JUDGING_POINTS)
-        size = float(np.linalg.norm(np.ptp(points, axis=0)))
-        corners = thinned[np.random.default_rng(0).integers(len(thinned), size=(_PROPOSALS, 3))]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        length = np.linalg.norm(normals, axis=1)
-        normals, corners = normals[length > 0] / length[length > 0, None], corners[length > 0, 0]
-        levels = np.einsum("pi,pi->p", normals, corners)
-        best = int(np.argmax((np.abs(thinned @ normals.T - levels) < _NEAR * size).sum(axis=0)))
-
-        def refine(inside: np.ndarray) -> tuple[Self, np.ndarray]:
-            plane = fit_robustly(cls.fit, points[inside], towards=towards).fit
-            distance = plane.distances_mm(points)
-            return plane, np.abs(distance) < off * max(robust_std(distance[inside]), 1e-9)
-
-        plane, inside = refine(np.abs(points @ normals[best] - levels[best]) < _NEAR * size)
-        for _ in range(_REFINEMENTS - 1):
-            plane, inside = refine(inside)
-        return plane, inside
 
 
 @dataclass(frozen=True, eq=False)

@@ -224,7 +224,7 @@ def test_campaigns_that_predict_nothing_are_refused_before_rendering(recordings,
 
 
 def write_results(folder: Path, name: str, *, error_mm: float, random_mm: float, systematic_mm: float) -> None:
-    """Write the evaluation of spheres with one spacing, or the inspection of a plane, as the software does."""
+    """Write the evaluation of spheres with one spacing, or the inspection of a pipe, as the software does."""
     expanded = 2 * math.hypot(random_mm, systematic_mm)
     parts = {"random_mm": random_mm, "systematic_mm": systematic_mm, "expanded_mm": expanded}
     evaluation = {
@@ -232,10 +232,11 @@ def write_results(folder: Path, name: str, *, error_mm: float, random_mm: float,
         "evaluation": {"figures_mm": {"SSE": error_mm, "PE": 0.1}, "vdi_range_mm": 0.08},
         "uncertainty": {"SSE": parts},
     }
-    flatness = {"value": 0.02 + error_mm, "random": random_mm, "systematic": systematic_mm}
-    inspection = {"format": "uwlts-findings", "features": [{"values": {"flatness": flatness}}]}
-    (folder / f"{name}.evaluation.json").write_text(json.dumps(evaluation), encoding="utf-8")
-    (folder / f"{name}.inspection.json").write_text(json.dumps(inspection), encoding="utf-8")
+    size = {"value": error_mm, "random": random_mm, "systematic": systematic_mm}
+    inspection = {"format": "uwlts-findings", "features": [{"values": {"diameter": size, "ovality": size}}]}
+    content = {"spheres": ("evaluation", evaluation), "pipe-around": ("inspection", inspection)}
+    kind, written = content[name]
+    (folder / f"{name}.{kind}.json").write_text(json.dumps(written), encoding="utf-8")
 
 
 def predict_without_rendering(campaign: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> ExperimentResult:
@@ -245,7 +246,7 @@ def predict_without_rendering(campaign: Path, out: Path, monkeypatch: pytest.Mon
         folders = [out / f"campaign-{seed}" for seed in seeds]
         for folder, systematic_mm in zip(folders, (0.12, 0.05), strict=True):
             folder.mkdir(parents=True)
-            for name in ("spheres", "plane"):
+            for name in ("spheres", "pipe-around"):
                 write_results(folder, name, error_mm=0.1, random_mm=0.03, systematic_mm=systematic_mm)
         return folders
 
@@ -254,10 +255,10 @@ def predict_without_rendering(campaign: Path, out: Path, monkeypatch: pytest.Mon
     return twin.predict(campaign=campaign, out=out, campaigns=2)
 
 
-PLANE = """
+PIPE = """
 [[recordings]]
-name = "plane"
-scene = "plane"
+name = "pipe-around"
+scene = "pipe-around"
 """
 
 
@@ -265,12 +266,13 @@ def test_predicted_uncertainties_contain_systematic_parts_and_certificates(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     described = tmp_path / "small.toml"
-    described.write_text(CAMPAIGN + TARGET + SPHERES + PLANE, encoding="utf-8")
+    described.write_text(CAMPAIGN + TARGET + SPHERES + PIPE, encoding="utf-8")
     result = predict_without_rendering(described, tmp_path / "out", monkeypatch)
-    spacing, flatness = result.table.errors()
+    spacing, diameter, ovality = result.table.errors()
     certificate = 0.01  # of the scene `spheres`
-    assert (spacing.scan, spacing.name, flatness.scan, flatness.name) == ("spheres", "SSE", "plane", "flatness error")
-    assert flatness.expanded_mm == pytest.approx([2 * math.hypot(0.03, part) for part in (0.12, 0.05)])
+    assert (spacing.scan, diameter.scan, ovality.scan) == ("spheres", "pipe-around", "pipe-around")
+    assert (spacing.name, diameter.name, ovality.name) == ("SSE", "diameter error", "ovality error")
+    assert ovality.expanded_mm == pytest.approx([2 * math.hypot(0.03, part) for part in (0.12, 0.05)])
     assert spacing.expanded_mm == pytest.approx([math.hypot(2 * 0.03, 2 * part, certificate) for part in (0.12, 0.05)])
     assert not result.understated
 
@@ -280,7 +282,7 @@ def test_deviations_beyond_the_stated_uncertainty_are_told_on_all_outputs(
 ):
     described = tmp_path / "small.toml"
     larger = CAMPAIGN.replace("[imperfections]", "[imperfections]\ntemperature_half_width_c = 30.0")
-    described.write_text(larger + TARGET + SPHERES + PLANE, encoding="utf-8")
+    described.write_text(larger + TARGET + SPHERES + PIPE, encoding="utf-8")
     with pytest.warns(DescriptionWarning, match="temperature of the water") as told:
         result = predict_without_rendering(described, tmp_path / "out", monkeypatch)
     assert [each.key for each in result.understated] == ["temperature_k", "drift_k"]
@@ -342,10 +344,6 @@ name = "step-scan"
 scene = "step-scan"
 
 [[recordings]]
-name = "plane"
-scene = "plane"
-
-[[recordings]]
 name = "pipe-around"
 scene = "pipe-around"
 
@@ -366,14 +364,8 @@ def test_errors_of_a_rendered_campaign_are_within_the_prediction(tmp_path: Path)
     campaign.write_text(SMALL, encoding="utf-8")
     options = {"campaign": campaign, "out": out, "water": "clear", "campaigns": 1, "every": 4, "spp": 8}
     result = twin.predict(**options)
-    assert {each.scan for each in result.table.errors()} >= {
-        "spheres",
-        "step-scan",
-        "plane",
-        "pipe-around",
-        "undercuts",
-    }
-    # Three expanded uncertainties are exceeded once in 10^9 figures; a flatness is biased by its own noise.
+    assert {each.scan for each in result.table.errors()} >= {"spheres", "step-scan", "pipe-around", "undercuts"}
+    # Three expanded uncertainties are exceeded once in 10^9 figures.
     for each in result.table.errors():
         assert np.all(np.abs(each.errors_mm) < 3 * np.array(each.expanded_mm)), each
         assert 0.001 < each.stated_mm < 1.0, each

@@ -1,4 +1,4 @@
-"""Flange and sea floor: sizes, topology, and deviation of facets from the functions."""
+"""Sea floor and other forms: sizes, topology, and deviation of facets from the functions."""
 
 import math
 
@@ -7,8 +7,7 @@ import pytest
 import trimesh
 from pydantic import ValidationError
 
-from twin.scene.forms import Flange, Seabed
-from twin.scene.forms.parts import flange_face
+from twin.scene.forms import Seabed
 from twin.scene.forms.seabed import _compute_sediment_height
 from twin.scene.forms.triangles import add_relief, bowed_plate, rounded_box, tube
 from twin.scene.scene_object import FreeForm
@@ -38,38 +37,6 @@ def middles(mesh: trimesh.Trimesh) -> np.ndarray:
     corners = mesh.triangles
     parts = [corners.mean(axis=1), *((corners[:, i] + corners[:, i - 1]) / 2 for i in range(3))]
     return np.concatenate(parts)
-
-
-@pytest.mark.parametrize("given", [{}, {"bolts": 3}, {"holes": 0}, {"holes": 16, "hole_diameter_mm": 20.0}])
-def test_a_flange_is_closed_and_holds_the_material_of_its_drawing(given):
-    flange = Flange(kind="flange", **given)
-    mesh = mesh_of(flange)
-    assert mesh.is_watertight and mesh.is_winding_consistent
-    area = flange.outer_diameter_mm**2 - flange.bore_diameter_mm**2 - flange.holes * flange.hole_diameter_mm**2
-    heads = flange.bolts * math.sqrt(3) / 2 * flange.head_width_mm**2 * (flange.head_height_mm + 0.5)
-    # A polygon whose sides are up to s = 0.004 mm inside a circle lacks two thirds of s along its length.
-    length = flange.outer_diameter_mm + flange.bore_diameter_mm + flange.holes * flange.hole_diameter_mm
-    lacking = math.pi * length * 0.004 * flange.thickness_mm
-    assert mesh.volume == pytest.approx(math.pi / 4 * area * flange.thickness_mm + heads, abs=lacking)
-    # One body with the bore and the holes, and the heads: V - E + F is 2 - 2 g for a body with g holes through it.
-    assert mesh.euler_number == 2 - 2 * (1 + flange.holes) + 2 * flange.bolts
-
-
-def test_a_flanges_face_is_a_saddle_of_its_flatness():
-    flange = Flange(kind="flange", flatness_mm=0.3, holes=8, hole_diameter_mm=14.0)
-    mesh = mesh_of(flange)
-    front = mesh.face_normals[:, 2] < -0.9
-    x, y, z = mesh.triangles[front].reshape(-1, 3).T
-    np.testing.assert_allclose(z, flange_face(flange, x, y, edges=True), rtol=0, atol=1e-12)
-    assert np.ptp(z) == pytest.approx(0.3, abs=1e-6)
-    x, y, z = middles(mesh)[np.tile(front, 4)].T
-    # Steps of at most some 5 mm on a second derivative of 0.3 / 82.5^2: h^2 / 8 of it is 0.0002 mm.
-    assert np.abs(z - flange_face(flange, x, y, edges=True)).max() < 5e-4
-    for at_x, at_y in flange.hole_places():
-        assert np.hypot(x - at_x, y - at_y).min() == pytest.approx(7.0, abs=0.005)
-        assert np.isnan(flange_face(flange, np.array([at_x]), np.array([at_y]))).all()
-    assert np.hypot(*flange.hole_places().T) == pytest.approx(62.5)
-    assert np.isfinite(flange_face(flange, np.array([0.0]), np.array([81.0]))).all()
 
 
 def test_a_sea_floor_has_ripples_and_stones():
@@ -102,21 +69,13 @@ def test_stones_of_several_sizes_lie_between_the_smallest_and_the_largest():
     assert seabed_height(bed, *at) >= 20.0
 
 
-WRONG = {
-    "touch each other": (Flange, {"kind": "flange", "holes": 30}),
-    "falls through": (Flange, {"kind": "flange", "bolts": 1, "head_width_mm": 12.0}),
-    "bolts is 5, for 4": (Flange, {"kind": "flange", "bolts": 5}),
-    "is not smaller": (Flange, {"kind": "flange", "bore_diameter_mm": 200.0}),
-    "smallest_stone_mm 20 is more": (Seabed, {"kind": "seabed", "smallest_stone_mm": 20.0}),
-    "stone_diameter_mm": (Seabed, {"kind": "seabed", "stone_diameter_mm": 400.0}),
-}
+WRONG = {"smallest_stone_mm 20 is more": {"smallest_stone_mm": 20.0}, "stone_diameter_mm": {"stone_diameter_mm": 400.0}}
 
 
 @pytest.mark.parametrize("message", WRONG)
-def test_forms_that_cannot_be_are_refused(message):
-    form, given = WRONG[message]
+def test_sea_floors_that_cannot_be_are_refused(message):
     with pytest.raises(ValidationError, match=message):
-        form.model_validate(given)
+        Seabed.model_validate({"kind": "seabed"} | WRONG[message])
 
 
 def test_a_block_with_rounded_edges_is_a_box_moved_by_a_sphere():

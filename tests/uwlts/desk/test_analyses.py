@@ -27,9 +27,19 @@ def step_cloud(height_mm: float = HEIGHT_MM, seed: int = 0) -> PointCloud:
     return PointCloud(points, np.full(frame.size, 100.0), frame, line)
 
 
+def weld_cloud() -> PointCloud:
+    """A bead of 2 mm height and 12 mm width along a plate of 30 x 80 mm, in 30 images of 400 lines, with noise."""
+    frame, line = (each.ravel() for each in np.mgrid[0:30, 0:400])
+    across = 0.2 * line - 40.0
+    bead = 2.0 * np.square(np.maximum(1 - np.square(across / 6), 0))
+    depth = 400.0 - bead + np.random.default_rng(0).normal(0, NOISE_MM, frame.size)
+    return PointCloud(np.column_stack([frame.astype(float), across, depth]), np.full(frame.size, 100.0), frame, line)
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     step_cloud().save(tmp_path / "plate.ply")
+    weld_cloud().save(tmp_path / "weld.ply")
     return tmp_path
 
 
@@ -69,26 +79,26 @@ def test_fields_are_parameters_of_the_public_functions():
     assert pipe["pdf"].switch and pipe["order"].file_kind == "description"
 
 
-def test_a_step_is_inspected_and_its_findings_have_place_and_interval(analyses, folder):
-    state = carried_out(analyses, "inspect step", {"cloud": "plate.ply"})
+def test_a_weld_is_inspected_and_its_findings_have_place_and_interval(analyses, folder):
+    before = names(folder)
+    state = carried_out(analyses, "inspect weld", {"cloud": "weld.ply"})
     assert state.error == ""
-    results = {"plate-step.html", "plate-step.findings.json", "plate-step-coloured.ply"}
-    assert set(state.files) == results and names(folder) == results | {"plate.ply"}
+    results = {"weld-weld.html", "weld-weld.findings.json", "weld-weld-coloured.ply"}
+    assert set(state.files) == results and names(folder) == results | before
     (finding,) = state.outcome.findings
     height, half = map(float, re.fullmatch(r"height ([\d.]+) ± ([\d.]+) mm", finding.values[0]).groups())
-    # The difference of the means of two faces with 1200 points each; 3.3 standard deviations: 0.1 % of false alarms.
-    std = NOISE_MM * np.sqrt(2 / 1200)
-    assert abs(height - HEIGHT_MM) < 3.3 * std and 1.5 * std < half < 10 * std
-    assert np.allclose(finding.place_mm, [19.5, 29.5, 400 - HEIGHT_MM / 2], atol=0.5)
-    assert analyses.shown == ["plate-step-coloured.ply"]
+    # The interval is 1.96 standard uncertainties; 4.5 of them are exceeded 7 times in a million.
+    assert abs(height - 2.0) < 4.5 / 1.96 * half and half < NOISE_MM
+    assert np.allclose(finding.place_mm, [14.0, 0.0, 398.3], atol=0.3)
+    assert analyses.shown == ["weld-weld-coloured.ply"]
 
 
 def test_nothing_is_replaced_without_being_asked(analyses, folder):
     (folder / "mine.html").write_text("mine", encoding="utf-8")
     with pytest.raises(OutputError, match=r"mine.html exists: .* tick 'replace existing'"):
-        analyses.start("inspect step", {"cloud": "plate.ply"}, name="mine", overwrite=False)
+        analyses.start("inspect weld", {"cloud": "weld.ply"}, name="mine", overwrite=False)
     assert (folder / "mine.html").read_text(encoding="utf-8") == "mine"
-    state = carried_out(analyses, "inspect step", {"cloud": "plate.ply"}, name="mine", overwrite=True)
+    state = carried_out(analyses, "inspect weld", {"cloud": "weld.ply"}, name="mine", overwrite=True)
     assert state.error == "" and "<html" in (folder / "mine.html").read_text(encoding="utf-8")[:200]
     with pytest.raises(OutputError, match="is one of the files to read"):
         analyses.start("export", {"file": "plate.ply", "format": ".ply"}, name="plate", overwrite=True)
@@ -96,9 +106,9 @@ def test_nothing_is_replaced_without_being_asked(analyses, folder):
 
 def test_a_cancelled_analysis_leaves_nothing(analyses, folder):
     before = names(folder)
-    analyses.start("inspect step", {"cloud": "plate.ply"}, name="", overwrite=False)
+    analyses.start("inspect weld", {"cloud": "weld.ply"}, name="", overwrite=False)
     with pytest.raises(DescriptionError, match="is running: wait until it ends, or cancel it"):
-        analyses.start("inspect gap", {"cloud": "plate.ply"}, name="", overwrite=False)
+        analyses.start("inspect pipe", {"cloud": "plate.ply"}, name="", overwrite=False)
     analyses.cancel()
     assert within(LONG_S, lambda: not analyses.state.running)
     assert analyses.state.error == "cancelled; nothing was written"
@@ -112,9 +122,9 @@ def test_errors_are_said_in_words_and_leave_nothing(analyses, folder):
     assert names(folder) == before and analyses.shown == []
     for given, words in (({}, "choose the cloud first"), ({"cloud": "../plate.ply"}, "is not a file of the folder")):
         with pytest.raises(DescriptionError, match=words):
-            analyses.start("inspect step", given, name="", overwrite=False)
+            analyses.start("inspect weld", given, name="", overwrite=False)
     with pytest.raises(DescriptionError, match="is not a name for a file"):
-        analyses.start("inspect step", {"cloud": "plate.ply"}, name="../away", overwrite=False)
+        analyses.start("inspect weld", {"cloud": "weld.ply"}, name="../away", overwrite=False)
 
 
 def test_clouds_are_compared_registered_and_exported(analyses, folder):

@@ -13,7 +13,7 @@ def test_intervals_contain_both_parts_of_the_uncertainty_and_end_at_the_least_va
     value = plain_value(FeatureKind.PIPE, "diameter", 100.0, 0.3, 0.4)
     assert value.uncertainty == pytest.approx(0.5)
     assert (value.low, value.high) == pytest.approx((100 - 0.5 * TWO_SIDED, 100 + 0.5 * TWO_SIDED), rel=1e-4)
-    small = plain_value(FeatureKind.HOLE, "position", 0.1, 0.3, None, least=0.0)
+    small = plain_value(FeatureKind.PIT, "depth", 0.1, 0.3, None, least=0.0)
     assert small.low == 0.0 and small.high == pytest.approx(0.1 + 0.3 * TWO_SIDED, rel=1e-4)
     assert small.systematic is None and small.unit == "mm" and value.text().startswith("diameter 100 (99.02 to 101)")
 
@@ -26,7 +26,7 @@ def test_wider_values_add_independent_parts() -> None:
     again = value.widen(random=1.2)
     assert again.random == pytest.approx(np.hypot(0.3, 1.2)) and again.systematic == pytest.approx(0.4)
     assert again.high == pytest.approx(100 + 1.3 * TWO_SIDED, rel=1e-4)
-    cut = plain_value(FeatureKind.HOLE, "position", 0.1, 0.03, None, least=0.0).widen(random=1.0)
+    cut = plain_value(FeatureKind.PIT, "depth", 0.1, 0.03, None, least=0.0).widen(random=1.0)
     assert cut.low == 0.0
 
 
@@ -56,15 +56,15 @@ def test_amplitudes_are_free_of_the_length_of_noise() -> None:
 
 def test_steps_of_coordinates_widen_lengths_only() -> None:
     values = (
-        plain_value(FeatureKind.STEP, "height", 5.0, 0.3, None),
-        plain_value(FeatureKind.STEP, "parallelism", 0.1, 0.02, None),
+        plain_value(FeatureKind.PIPE, "diameter", 5.0, 0.3, None),
+        plain_value(FeatureKind.PIPE, "axis slope 1", 0.1, 0.02, None),
     )
     nothing = np.zeros(3)
-    step = Feature(FeatureKind.STEP, "step", values, nothing, np.eye(3), nothing, np.arange(4))
-    whole = Inspection("step", (step,), nothing, nothing)
+    pipe = Feature(FeatureKind.PIPE, "pipe", values, nothing, np.eye(3), nothing, np.arange(4))
+    whole = Inspection("pipe", (pipe,), nothing, nothing)
     cloud = PointCloud(np.zeros((1, 3)), np.ones(1), np.zeros(1, int), np.zeros(1, int), metadata={STEP: 1.2})
     (wider,) = whole.consider_cloud(cloud).features
-    assert wider["height"].systematic == pytest.approx(1.2 / np.sqrt(12)) and wider["parallelism"] == values[1]
+    assert wider["diameter"].systematic == pytest.approx(1.2 / np.sqrt(12)) and wider["axis slope 1"] == values[1]
     assert whole.consider_cloud(cloud).notes == (
         "uncertainties contain 0.35 mm for the steps of the cloud's stored coordinates",
     )

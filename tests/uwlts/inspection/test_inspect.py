@@ -13,7 +13,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
-from scipy.stats import norm
 
 import uwlts
 from uwlts.cli import app
@@ -21,7 +20,6 @@ from uwlts.errors import EvaluationError
 from uwlts.inspection.bell_maps import UnrolledSurface
 from uwlts.inspection.blemish_search import search_blemishes
 from uwlts.inspection.features import DEFINITIONS, FeatureKind
-from uwlts.inspection.flat import _estimate_step_height, _Hole, _mask_inner_points, _measure_bolt_circle
 from uwlts.inspection.inspect import inspect_cloud
 from uwlts.inspection.pipe_form import PipeFormRule, fit_pipe, pipe_features
 from uwlts.inspection.weld import _find_toes
@@ -335,125 +333,6 @@ def within(feature, truth):
         assert feature[name].value == pytest.approx(value, abs=GATE * feature[name].uncertainty), name
 
 
-def test_a_step_is_measured():
-    cloud = flat_scan(np.random.default_rng(7), lambda x, y: np.where(y > 10, 12.34, 0.0) + 0.01 * x, everywhere)
-    step = uwlts.inspect_step(cloud).features[0]
-    # The height is perpendicular to the faces, which are inclined by 0.01.
-    within(step, {"height": 12.34 * np.cos(np.arctan(0.01))})
-    assert step["height"].uncertainty < 0.02 and step["parallelism"].low < 0.01
-
-
-def test_a_flange_is_measured():
-    angles = 2 * np.pi * np.arange(6) / 6 + 0.2
-
-    def face(x, y):
-        inside = (np.hypot(x, y) < 55) & (np.hypot(x, y) > 18)
-        for angle in angles:
-            inside &= np.hypot(x - 38 * np.cos(angle), y - 38 * np.sin(angle)) > 6
-        return inside
-
-    rng = np.random.default_rng(8)
-    cloud = flat_scan(rng, lambda x, y: 0.1 * np.square(x / 55), face, along=(-60, 60, 0.5))
-    datum = flat_scan(rng, lambda x, y: 30 + 0.005 * x, everywhere)
-    found = uwlts.inspect_flange(cloud, datum=datum)
-    flange = found.features[0]
-    within(flange, {"bore": 36.0, "bolt circle": 76.0, "parallelism": np.degrees(np.arctan(0.005))})
-    holes = found.select(FeatureKind.HOLE)
-    assert len(holes) == 6
-    for hole in holes:
-        within(hole, {"diameter": 12.0})
-        np.testing.assert_allclose(hole.extent_mm, [hole["diameter"].value] * 2 + [0.0])
-        assert hole["position"].low < 0.01
-    # A parabola from the bore to the rim; the outermost cells average over a twenty-fourth of the face.
-    assert flange["flatness"].value == pytest.approx(0.1 * (1 - np.square(18 / 55)), abs=0.01)
-    # The noise of a perfect face is subtracted: what is left is within twice the stated uncertainty.
-    plain = uwlts.inspect_flange(flat_scan(rng, lambda x, y: 0 * x, face, along=(-60, 60, 0.5))).features[0]["flatness"]
-    assert plain.value < 2 * plain.uncertainty and plain.value < 0.01
-
-
-def test_points_near_edges_of_profiles_are_no_inner_points():
-    """Two profiles of 30 lines, one with a gap of ten lines: four lines beside each edge; single lines may lack."""
-    line = np.concatenate([np.delete(np.arange(30), 15), np.arange(10), np.arange(20, 30)])
-    frame = np.repeat([4, 7], [29, 20])
-    order = np.random.default_rng(1).permutation(49)
-    cloud = PointCloud(np.zeros((49, 3)), np.ones(49), frame[order], line[order])
-    inner = _mask_inner_points(cloud, np.arange(49))
-    expected = np.concatenate(
-        [
-            np.delete((np.arange(30) >= 4) & (np.arange(30) < 26), 15),
-            2 * [False, False, False, False, True, True, False, False, False, False],
-        ]
-    )
-    np.testing.assert_array_equal(inner, expected[order])
-    unknown = PointCloud(np.zeros((49, 3)), np.ones(49), np.full(49, -1), line)
-    assert _mask_inner_points(unknown, np.arange(49)).all()
-
-
-def test_the_height_of_a_step_is_that_between_its_two_most_frequent_levels():
-    rng = np.random.default_rng(2)
-    levels = np.concatenate([rng.normal(3.0, 0.02, 6000), rng.normal(-9.0, 0.02, 3000), rng.uniform(-9, 3, 500)])
-    # Bins of the histogram are wider than the noise.
-    assert _estimate_step_height(levels) == pytest.approx(12.0, rel=0.02)
-    with pytest.raises(EvaluationError, match="only one face found"):
-        _estimate_step_height(np.full(100, 2.0))
-
-
-def test_a_bolt_circle_is_that_of_its_holes():
-    """Five of six even holes, with 0.05 mm each: the radius has a variance by least squares, offsets of zero."""
-    angles = 0.4 + 2 * np.pi * np.array([0, 1, 2, 3, 5]) / 6
-    units = np.column_stack([np.cos(angles), np.sin(angles)])
-    random, growth = np.diag([0.05**2, 0.05**2, 0.1**2]), 1e-3
-    bolts = [
-        _Hole(
-            np.array([3.0, -7.0]) + 40 * unit, 6.0, random, np.array([[*(growth * 40 * unit), 0.0]]), np.arange(9), 0.01
-        )
-        for unit in units
-    ]
-    circle, offsets = _measure_bolt_circle(bolts)
-    design = np.column_stack([units, np.ones(5)])
-    assert circle.value == pytest.approx(80.0)
-    assert circle.random == pytest.approx(2 * 0.05 * np.sqrt(np.linalg.inv(design.T @ design)[2, 2]))
-    assert circle.systematic == pytest.approx(80 * growth)
-    np.testing.assert_allclose(offsets, 0.0, atol=1e-9)
-    # All six, one of them 0.3 mm outside: the circle follows by a sixth in radius and a third in position.
-    whole = [
-        _Hole(40 * np.array([np.cos(a), np.sin(a)]), 6.0, random, None, np.arange(9), 0.0)
-        for a in 2 * np.pi / 6 * np.arange(6)
-    ]
-    whole[0] = replace(whole[0], middle=whole[0].middle + [0.3, 0.0])
-    circle, offsets = _measure_bolt_circle(whole)
-    assert circle.value == pytest.approx(80.1, abs=1e-3) and circle.systematic is None
-    assert offsets[0] == pytest.approx(0.3 - 0.1 - 0.05, abs=1e-3)
-
-
-def test_a_gap_is_measured():
-    def apart(x, y):
-        return np.abs(y - 0.02 * x) > 1.5 + 0.004 * x
-
-    cloud = flat_scan(np.random.default_rng(9), lambda x, y: np.where(y > 0, 0.3, 0.0), apart)
-    gap = uwlts.inspect_gap(cloud).features[0]
-    # Perpendicular to the middle line, which is inclined by 0.02.
-    within(gap, {"width": 3.0 * np.cos(0.02), "parallelism": np.degrees(0.008), "flush": 0.3})
-    assert gap["width"].random < 0.03 and gap["width"].uncertainty < 0.2
-
-
-def test_blur_beyond_an_edge_shows_in_the_brightness():
-    """A gap of 3 mm with blurred edges, visible down to a quarter of the brightness: 0.13 mm beyond each edge."""
-    blur = 0.2
-
-    def brightness(y):
-        return norm.cdf((np.abs(y) - 1.5) / blur)
-
-    cloud = flat_scan(
-        np.random.default_rng(16), lambda x, y: 0 * y, lambda x, y: brightness(y) > 0.25, across=(-15, 15, 250)
-    )
-    stripes = replace(cloud, intensity=100 * brightness(cloud.points_mm[:, 1]))
-    known = replace(stripes, metadata={FOOTPRINT: [0.15, blur], FOOTPRINT_STD: 0.2})
-    narrow, right = (uwlts.inspect_gap(each).features[0]["width"].value for each in (stripes, known))
-    # Without brightness each edge is known to half a line's spacing of 0.12 mm.
-    assert narrow < 2.93 and right == pytest.approx(3.0, abs=0.03)
-
-
 def weld_height(x, y, *, undercut, offset):
     """Return a bead (1 - t^2)^2 of 2 mm and 12 mm on plates with an offset, with grooves of 2.4 mm at its toes."""
     t = np.abs(y) / 6
@@ -543,30 +422,6 @@ def test_a_weld_of_many_even_profiles_is_measured_and_what_is_left_out_is_named(
     assert number == pytest.approx(10, abs=3)
 
 
-def test_holes_that_are_not_measured_are_named():
-    """A bolt hole of another diameter, a slot, and a second gap."""
-
-    def face(x, y):
-        inside = (np.hypot(x, y) < 55) & (np.hypot(x, y) > 18)
-        for k, angle in enumerate(2 * np.pi * np.arange(6) / 6 + 0.2):
-            inside &= np.hypot(x - 38 * np.cos(angle), y - 38 * np.sin(angle)) > (9 if k == 2 else 5)
-        return inside & ((np.abs(x - 48) > 4) | (np.abs(y + 8) > 1.5))
-
-    cloud = flat_scan(np.random.default_rng(18), lambda x, y: 0 * x, face, along=(-60, 60, 0.5))
-    flange = uwlts.inspect_flange(cloud)
-    assert len(flange.select(FeatureKind.HOLE)) == 5
-    left_out = [note for note in flange.notes if "is omitted" in note]
-    assert any("its diameter is" in note for note in left_out), flange.notes
-    assert any("not round" in note for note in left_out), flange.notes
-
-    def gapped(x, y):
-        return (np.abs(y) > 1.5) & ((np.abs(y - 30) > 1) | (x > 0))
-
-    gap = uwlts.inspect_gap(flat_scan(np.random.default_rng(19), lambda x, y: 0 * x, gapped))
-    within(gap.features[0], {"width": 3.0})
-    assert sum("profiles cross it, fewer than the measured gap" in note for note in gap.notes) == 1
-
-
 def test_what_stands_at_the_rim_of_a_section_is_not_its_top():
     """Few sections, one of them with a point higher than the bead at the end of its grid."""
     grid = np.linspace(-12.0, 12.0, 97)
@@ -623,16 +478,14 @@ def test_wrong_input_is_refused():
     cloud = flat_scan(rng, lambda x, y: 0 * x, everywhere, along=(-5, 5, 1.0), across=(-20, 20, 100))
     for words, options in (
         ("a weld does not take `wall_mm`", {"kind": "weld", "wall_mm": 9.0}),
-        ("a pipe does not take `datum`", {"datum": cloud}),
-        ("a step does not take `section_mm`", {"kind": "step", "section_mm": 1.0}),
+        ("a pipe does not take `section_mm`", {"section_mm": 1.0}),
         ("wall_mm is -1", {"wall_mm": -1.0}),
         ("false_alarm is 2", {"false_alarm": 2.0}),
         ("no bead found", {"kind": "weld"}),
-        ("no gap found", {"kind": "gap"}),
     ):
         with pytest.raises(EvaluationError, match=words):
             inspect_cloud(cloud, **({"kind": "pipe"} | options))
     few = PointCloud(cloud.points_mm[:50], cloud.intensity[:50], cloud.frame[:50], cloud.line[:50])
-    for kind in ("pipe", "weld", "step", "flange", "gap"):
+    for kind in ("pipe", "weld"):
         with pytest.raises(EvaluationError, match="at least"):
             inspect_cloud(few, kind)

@@ -72,15 +72,17 @@ def test_near_the_origin_32_bits_suffice(tmp_path):
     assert not any(STEP in read_cloud(tmp_path / name).metadata for name in ("a.las", "a.e57"))
 
 
-def test_a_plate_measured_in_coarse_steps_has_a_wider_interval():
-    points = plate(np.random.default_rng(6))
-    points[points[:, 0] > 30, 2] -= 5.0
+def test_a_pipe_measured_in_coarse_steps_has_a_wider_interval():
+    rng = np.random.default_rng(6)
+    x, angle = (each.ravel() for each in np.meshgrid(np.arange(0, 30, 0.5), np.arange(-1.2, 1.2, 0.02)))
+    radius = 30.0 + rng.normal(0, 0.01, x.size)
+    points = np.column_stack([x, radius * np.sin(angle), 400 - radius * np.cos(angle)])
     fine, coarse = (
-        uwlts.inspect_step(make_foreign_cloud(points, frame=np.zeros(len(points)), line=None, step_mm=step))
+        uwlts.inspect_pipe(make_foreign_cloud(points, frame=np.zeros(len(points)), line=None, step_mm=step))
         for step in (0.0, 0.2)
     )
-    height, wide = fine.features[0]["height"], coarse.features[0]["height"]
-    assert wide.value == height.value
-    assert wide.uncertainty == pytest.approx(np.hypot(height.uncertainty, 0.2 / np.sqrt(12)), rel=1e-6)
-    assert wide.low < height.low - 0.1 and wide.high > height.high + 0.1
+    diameter, wide = fine.features[0]["diameter"], coarse.features[0]["diameter"]
+    assert wide.value == diameter.value
+    assert wide.uncertainty == pytest.approx(np.hypot(diameter.uncertainty, 0.2 / np.sqrt(12)), rel=1e-6)
+    assert wide.low < diameter.low - 0.005 and wide.high > diameter.high + 0.005
     assert any("steps of the cloud's stored coordinates" in note for note in coarse.notes)

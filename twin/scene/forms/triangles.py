@@ -58,11 +58,7 @@ def grid_faces(shape: tuple[int, ...], *, closed: bool = False) -> np.ndarray:
     beside = np.roll(corner, -1, axis=1)
     if not closed:
         corner, beside = corner[:, :-1], beside[:, :-1]
-    return quads(*(part.ravel() for part in (corner[:-1], beside[:-1], beside[1:], corner[1:])))
-
-
-def quads(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Return triangles (2 N, 3) of quadrilaterals with corners (N,) in this order."""
+    a, b, c, d = (part.ravel() for part in (corner[:-1], beside[:-1], beside[1:], corner[1:]))
     return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
 
 
