@@ -24,7 +24,7 @@ from uwlts.desk.shown_state import Board
 from uwlts.errors import DescriptionError, Error, OutputError
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.inspection.features import BLEMISHES, Inspection
-from uwlts.report.measured_values import judge_feature, load_order, sort_by_severity
+from uwlts.inspection.findings_order import judge_feature, load_order, sort_by_severity
 from uwlts.runtime.command_line import descriptions, option_type
 from uwlts.runtime.progress import ProgressListener
 from uwlts.runtime.workers import run_jobs

@@ -23,7 +23,7 @@ from uwlts.desk.analyses import (
 from uwlts.desk.board_page import NumberField
 from uwlts.desk.desk_files import list_files
 from uwlts.errors import Error
-from uwlts.report.measured_values import load_order
+from uwlts.inspection.findings_order import load_order
 
 AddButton = Callable[[str, Callable[[], object]], ui.button]
 

@@ -18,6 +18,9 @@ from uwlts.desk.desk_files import find_file, new_path
 from uwlts.desk.shown_state import Board
 from uwlts.errors import DescriptionError, Error
 from uwlts.inspection.picking import (
+    MEASURED_ENDINGS,
+    MeasuredValue,
+    MeasuredValues,
     PickedMeasurement,
     Section,
     Shape,
@@ -26,8 +29,9 @@ from uwlts.inspection.picking import (
     fit_shape_near,
     measure_length,
     measure_step,
+    read_measured,
 )
-from uwlts.report.measured_values import MEASURED_ENDINGS, MeasuredValue, MeasuredValues, read_measured, write_measured
+from uwlts.report.findings_page import write_measured
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import name_cloud
 

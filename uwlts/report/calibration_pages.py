@@ -160,9 +160,7 @@ RECALIBRATION = "recalibration"
 """Kind of the page, in the name of its JSON file."""
 
 
-def write_recalibration(
-    path: str | Path, found: Recalibrated, *, title: str = "Recalibration by passes", overwrite: bool = False
-) -> None:
+def write_recalibration(path: str | Path, found: Recalibrated, *, overwrite: bool = False) -> None:
     """Write the page of a recalibration, and its figures, advice and doubts as JSON beside it.
 
     Parameters
@@ -171,8 +169,6 @@ def write_recalibration(
         Page to write; for pipe.html, the figures go into pipe.recalibration.json.
     found : Recalibrated
         Result of `uwlts.recalibrate`.
-    title : str
-        Title of the page.
     overwrite : bool
         Replace existing files.
 
@@ -185,7 +181,7 @@ def write_recalibration(
     text = render_page(
         "uwlts.report",
         "recalibration.html.j2",
-        title=title,
+        title="Recalibration by passes",
         passes=", ".join(found.passes),
         lengths=[
             Tile(f"100 mm along {each.axis}", f"+-{each.after_mm:.3f} mm", f"before: +-{each.before_mm:.3f} mm")

@@ -11,6 +11,13 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from uwlts.calibration.joint.calibrated_volume import (
+    LengthUncertainty,
+    compare_calibrations,
+    prepare_use,
+    require_same_sensor,
+    uncertainty_maps,
+)
 from uwlts.calibration.joint.observability import list_regions
 from uwlts.calibration.joint.stored_estimate import require_joint
 from uwlts.model.calibration import Calibration
@@ -30,13 +37,6 @@ from uwlts.pages.toolkit import (
     write_page,
 )
 from uwlts.report.certificate import Certificate, ParameterRow, make_certificate, parameter_rows
-from uwlts.report.certificate_volume import (
-    LengthUncertainty,
-    compare_calibrations,
-    prepare_use,
-    require_same_sensor,
-    uncertainty_maps,
-)
 from uwlts.report.plot import DEVIATIONS
 from uwlts.storage.calibration_file import read_calibration
 

@@ -169,9 +169,7 @@ _VIEWS = ((0, 1), (0, 2), (1, 2))  # axes of plan, front and side view
 REGISTRATION = "registration"  # kind of the page, in the name of its JSON file
 
 
-def write_registration(
-    path: str | Path, registered: RegisteredScans, *, title: str = "Registration of scans", overwrite: bool = False
-) -> None:
+def write_registration(path: str | Path, registered: RegisteredScans, *, overwrite: bool = False) -> None:
     """Write the page of a registration, and its figures, poses and their covariance as JSON beside it.
 
     Parameters
@@ -180,8 +178,6 @@ def write_registration(
         Page to write; the figures go into a JSON file of the same name.
     registered : RegisteredScans
         Result of `uwlts.register`.
-    title : str
-        Title of the page.
     overwrite : bool
         Replace existing files.
 
@@ -193,7 +189,7 @@ def write_registration(
     text = render_page(
         "uwlts.report",
         "registration.html.j2",
-        title=title,
+        title="Registration of scans",
         first=registered.names[0],
         summary=[line for line in registered.lines() if not line.startswith("  open")],
         open_movements=[(registered.names[each.scan], each.describe()) for each in registered.open_movements],

@@ -13,11 +13,11 @@ import numpy as np
 from matplotlib.colors import ListedColormap
 
 from uwlts._version import __version__
-from uwlts.errors import EvaluationError
+from uwlts.errors import DescriptionError, EvaluationError
 from uwlts.evaluation.evaluate import read_evaluation
-from uwlts.evaluation.figures import VERDICTS, Figure
+from uwlts.evaluation.figures import Figure
 from uwlts.files.json_files import EDITED, json_text
-from uwlts.files.writing import hash_file
+from uwlts.files.writing import hash_file, refuse_unsuitable, write_file
 from uwlts.inspection.features import (
     BLEMISHES,
     COVERAGE,
@@ -28,7 +28,17 @@ from uwlts.inspection.features import (
     FeatureValue,
     Inspection,
 )
+from uwlts.inspection.findings_order import (
+    VERDICTS,
+    FindingOrder,
+    format_place,
+    judge_feature,
+    load_order,
+    resolve_datum,
+    sort_by_severity,
+)
 from uwlts.inspection.inspect import InspectionKind, inspect_cloud
+from uwlts.inspection.picking import COLUMNS, MEASURED_ENDINGS, MeasuredValues, read_measured
 from uwlts.model.calibration import calibration_digest
 from uwlts.model.sensor import Table
 from uwlts.pages.toolkit import (
@@ -44,17 +54,6 @@ from uwlts.pages.toolkit import (
     write_page,
 )
 from uwlts.report.certificate import check_certificate
-from uwlts.report.measured_values import (
-    COLUMNS,
-    FindingOrder,
-    MeasuredValues,
-    format_place,
-    judge_feature,
-    load_order,
-    read_measured,
-    resolve_datum,
-    sort_by_severity,
-)
 from uwlts.report.plot import DEVIATIONS, surface_limit_mm
 from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.cloud import PointCloud, compute_normal_std
@@ -202,6 +201,25 @@ def write_findings(
     }
     write_page(page, text, beside=json_text(record, indent=1), kind=FINDINGS, pdf=pdf, overwrite=overwrite)
     return found
+
+
+def write_measured(page: str | Path, measured: MeasuredValues, *, title: str, overwrite: bool = False) -> list[Path]:
+    """Write values measured by hand as a page NAME.measured.html, and beside it as JSON and CSV; return the paths.
+
+    Raises DescriptionError if the list is empty; OutputError if a file exists and ``overwrite`` is not set, or cannot
+    be written.
+    """
+    if not measured.values:
+        raise DescriptionError("the list of measured values is empty: measure something first")
+    paths = [Path(page).with_suffix(Path(each).suffix) for each in MEASURED_ENDINGS]
+    for path, ending in zip(paths, MEASURED_ENDINGS, strict=True):
+        refuse_unsuitable(path, overwrite=overwrite, endings=(ending,))
+    rows = [each.row() for each in measured.values]
+    text = render_page("uwlts.report", "measured.html.j2", title=title, columns=COLUMNS, rows=rows)
+    measured.save(paths[1], overwrite=overwrite)
+    write_file(paths[2], measured.table(), overwrite=overwrite)
+    write_page(paths[0], text, overwrite=overwrite)
+    return paths
 
 
 def _list_sources(

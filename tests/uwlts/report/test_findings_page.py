@@ -13,10 +13,10 @@ from uwlts.cli import app
 from uwlts.errors import EvaluationError, OutputError, SetupError
 from uwlts.files.writing import hash_file
 from uwlts.inspection.features import Feature, FeatureKind, Inspection
+from uwlts.inspection.findings_order import FindingOrder
 from uwlts.model.artefacts import SphereStandard
 from uwlts.pages import toolkit
 from uwlts.report.findings_page import _conclude
-from uwlts.report.measured_values import FindingOrder
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
 
 DEPTH_MM = 1.5
