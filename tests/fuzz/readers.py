@@ -51,7 +51,6 @@ from uwlts.storage.data_set import Sample, ShardReader, load_dataset, open_shard
 from uwlts.storage.figure_table import FigureTable, MeasuredFigure, read_figures
 from uwlts.storage.image_file import read_image
 from uwlts.storage.import_.camera_files import read_intrinsics, set_intrinsics
-from uwlts.storage.import_.centre_lines import read_profiles as read_centre_lines
 from uwlts.storage.import_.folder_description import capture_header, described_sensor, read_description, read_header
 from uwlts.storage.import_.matching import read_rows
 from uwlts.storage.mesh_file import read_mesh
@@ -384,15 +383,6 @@ def _read_card(path: Path) -> None:
         load_dataset(folder)
 
 
-def _lines(path: Path) -> None:
-    """Write centre lines of two profiles as an array or a table."""
-    numbers = np.arange(12.0).reshape(2, 6)
-    if path.suffix == ".npy":
-        np.save(path, numbers)
-    else:
-        np.savetxt(path, numbers, delimiter=",")
-
-
 READERS = {
     each.name: each
     for each in (
@@ -457,8 +447,6 @@ READERS = {
         Reader("shard-tar", ".tar", "bytes", _shard, _read_shard),
         Reader("card", ".json", "json", _card, _read_card),
         Reader("data-set", ".toml", "toml", _shipped("datasets/stripe-turbid.toml"), load_data_set),
-        Reader("centre-lines-npy", ".npy", "bytes", _lines, lambda path: read_centre_lines(path, 6)),
-        Reader("centre-lines-csv", ".csv", "lines", _lines, lambda path: read_centre_lines(path, 6)),
         Reader(
             "shape",
             ".toml",

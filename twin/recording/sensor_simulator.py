@@ -22,8 +22,6 @@ from twin.scene.description import PrintedPlate, Scene, medium_of, replace_value
 from twin.scene.finish import shift_points
 from twin.scene.platforms import Light, Platform, Shot
 from twin.sensor.detector import (
-    INVALID,
-    PeakFinder,
     add_ghost,
     add_glare,
     as_built,
@@ -39,8 +37,7 @@ from twin.sensor.speckle import Speckle, coherence
 from uwlts.errors import DesignError
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Sensor
-from uwlts.model.stripe import Coordinates
-from uwlts.storage.capture import Frame, Seen
+from uwlts.storage.capture import Frame
 
 ShotLight: TypeAlias = tuple[np.ndarray, LaserFrame | None]
 """Irradiance (H, W) of lamp and daylight before the lens in W/mm2, and the laser's light, None if it is off."""
@@ -140,9 +137,6 @@ class SensorSimulator:
         if flaws.lamp_reflection and mounted:
             self._lamp_ring = reflect_ring(self.renderer.view, self.sensor, reflectance=flaws.lamp_reflection)
         self._laser_shares = laser_shares(camera.height_px, camera.width_px) if flaws.colour_filter else None
-        self.peak_finder = None
-        if flaws.camera_3d:
-            self.peak_finder = PeakFinder(camera, self.sensor.detector.full_scale_dn(), flaws.camera_3d)
         self._crossings: tuple[Shot, Crossings] | None = None
         self._pattern = None
         if options.effects.fixed_pattern:
@@ -307,14 +301,8 @@ class SensorSimulator:
             number = course.numbers[shot]
             pose = course.reported[number]
             covariance = None if course.covariance is None else course.covariance[number]
-        seen: Seen = self._render_image(light, shot, index)
-        if self.peak_finder is not None and shot.light == "laser":
-            camera = self.sensor.camera
-            length = camera.height_px if camera.stripe_along == "width" else camera.width_px
-            meant = Coordinates(scale=self.peak_finder.scale_px(), invalid=INVALID)
-            seen = meant.stripe(self.peak_finder.numbers(seen), stripe_along=camera.stripe_along, length_px=length)
         return Frame(
-            seen,
+            self._render_image(light, shot, index),
             stage_mm=shot.stage_mm,
             laser_on=shot.light == "laser",
             exposure_ms=self._choose_exposure(shot),

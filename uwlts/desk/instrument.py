@@ -37,7 +37,7 @@ from uwlts.model.calibration import AnyCalibration
 from uwlts.model.sensor import Sensor
 from uwlts.report.file_description import calibration_lines
 from uwlts.storage.calibration_file import load_calibration
-from uwlts.storage.capture import Capture, Frame, drawable_image, part_path
+from uwlts.storage.capture import Capture, Frame, part_path
 from uwlts.stripe import Stripe
 
 _P = ParamSpec("_P")
@@ -360,18 +360,17 @@ class Instrument:
                 raise
             return
         self._lost = 0
-        seen = measure_brightness(frame.seen, connected.sensor, light)
+        seen = measure_brightness(frame.image, connected.sensor, light)
         full, exposure_ms = connected.sensor.detector.full_scale_dn(), frame.exposure_ms or self.exposure_ms[light]
-        level = "centre line" if math.isnan(seen.level) else f"{100 * seen.level:.0f} % of full scale"
-        caption, pixels = f"live, {light}, exposure {exposure_ms:.4g} ms, {level}", None
+        caption = f"live, {light}, exposure {exposure_ms:.4g} ms, {100 * seen.level:.0f} % of full scale"
+        pixels = None
         if light == "laser":
-            stripe = get_stripe(frame.seen, connected.sensor)
+            stripe = get_stripe(frame.image, connected.sensor)
             pixels = stripe.pixels()
             caption += f"; stripe on {len(pixels)} of {len(stripe.status)} profile lines"
             self._show_profile(connected, frame, stripe)
         saturated = seen.saturated / max(seen.counted, 1)
-        image = drawable_image(frame.seen, connected.sensor.camera)
-        self._live = Picture(image, full_dn=full, caption=caption, stripe=pixels, saturated=saturated)
+        self._live = Picture(frame.image, full_dn=full, caption=caption, stripe=pixels, saturated=saturated)
         self._board.show(self._live)
 
     def _show_profile(self, connected: _Connected, frame: GrabbedFrame, stripe: Stripe) -> None:
@@ -380,7 +379,7 @@ class Instrument:
             return
         # Until the first movement the position may be unknown.
         place_mm, exposure_ms = self._board.position_mm or 0.0, frame.exposure_ms or 0.0
-        placed = Frame(frame.seen, place_mm, True, exposure_ms, frame.time_s)
+        placed = Frame(frame.image, place_mm, True, exposure_ms, frame.time_s)
         profile = FrameProfile(placed, stripe, connected.plan.header("live"), self.calibration)
         try:
             # Making the points shows whether the calibration fits.

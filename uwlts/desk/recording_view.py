@@ -12,8 +12,8 @@ import numpy as np
 from uwlts.desk.shown_state import Board, FrameProfile, Picture
 from uwlts.errors import CaptureError
 from uwlts.model.calibration import AnyCalibration
-from uwlts.storage.capture import Capture, CaptureHeader, Frame, drawable_image, part_path
-from uwlts.stripe import find_stripe, warm_up
+from uwlts.storage.capture import Capture, CaptureHeader, Frame, part_path
+from uwlts.stripe import extract_stripe, warm_up
 
 LOOK_S = 0.1  # interval between checks for new images; a check takes a few ms
 _DAMAGED_S = 5.0
@@ -48,21 +48,19 @@ class RecordingView:
             board.show(Picture(frame.image, full_dn=full, caption=caption))
             return
         camera = self._header.sensor.camera
-        stripe = find_stripe(frame.seen, stripe_along=camera.stripe_along, saturation=full)
-        pixels, saturated, remarks = stripe.pixels(), None, []
+        stripe = extract_stripe(frame.image, stripe_along=camera.stripe_along, saturation=full)
+        pixels, remarks = stripe.pixels(), []
         self._found, self._lines = self._found + len(pixels), self._lines + len(stripe.status)
         caption += f"; stripe on {self._found:,} of {self._lines:,} profile lines so far"
-        if isinstance(frame.seen, np.ndarray):
-            brightest = frame.seen.max(axis=0 if camera.stripe_along == "width" else 1)
-            saturated = float((brightest >= full).mean())
-            if saturated > _MANY:
-                remarks.append("saturated on many lines: shorten the exposure")
-            elif np.quantile(brightest, 0.98) < _FAINT * full:
-                remarks.append("faint: lengthen the exposure, or is the laser off?")
+        brightest = frame.image.max(axis=0 if camera.stripe_along == "width" else 1)
+        saturated = float((brightest >= full).mean())
+        if saturated > _MANY:
+            remarks.append("saturated on many lines: shorten the exposure")
+        elif np.quantile(brightest, 0.98) < _FAINT * full:
+            remarks.append("faint: lengthen the exposure, or is the laser off?")
         if len(stripe.lines) < _FEW * len(stripe.status):
             remarks.append("almost no stripe: is the object in the volume?")
-        image = drawable_image(frame.seen, camera)
-        board.show(Picture(image, full_dn=full, caption=caption, stripe=pixels, saturated=saturated))
+        board.show(Picture(frame.image, full_dn=full, caption=caption, stripe=pixels, saturated=saturated))
         if self._calibration is not None and len(stripe.lines):
             profile = FrameProfile(frame, stripe, self._header, self._calibration)
             board.cloud.add(profile.points.points_mm, intensity=profile.points.intensity)

@@ -44,7 +44,7 @@ from uwlts.storage.ros_messages import (
     pack_points,
     point_cloud2,
 )
-from uwlts.stripe import find_stripe, warm_up
+from uwlts.stripe import extract_stripe, warm_up
 
 
 def scan(
@@ -315,8 +315,8 @@ class ScanService:
     def _show(self, frame: Frame, number: int, header: CaptureHeader) -> None:
         if not frame.laser_on:
             return
-        stripe = find_stripe(
-            frame.seen, stripe_along=header.sensor.camera.stripe_along, saturation=header.saturation_dn
+        stripe = extract_stripe(
+            frame.image, stripe_along=header.sensor.camera.stripe_along, saturation=header.saturation_dn
         )
         if len(stripe.lines):
             cloud = FrameProfile(frame, stripe, header, self._calibration).measured()

@@ -30,7 +30,7 @@ from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import Frame
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.numbering import unwrap_counts
-from uwlts.stripe import find_stripe, warm_up
+from uwlts.stripe import extract_stripe, warm_up
 
 _SPARE_MM, _SPARE_S = 1.0, 0.3
 """Travel at constant speed before and after the stored frames: a distance, and in addition a time."""
@@ -116,21 +116,19 @@ def record_continuously(
             f"at {continuous.speed_mm_per_s:g} mm/s the camera has {1e3 / rate_hz:.3g} ms for a step of "
             f"{abs(plan.stage.step_mm):g} mm, too little for an exposure of {exposure_ms:.3g} ms: travel more slowly"
         )
-    expected, lines = len(positions) * len(passes), camera.info.coordinates is not None
-    dtype = np.dtype(np.uint16 if camera.info.bits > 8 and not lines else np.uint8)
+    expected = len(positions) * len(passes)
+    dtype = np.dtype(np.uint16 if camera.info.bits > 8 else np.uint8)
     settings = {"exposure_ms": exposure_ms, "gain_db": plan.gain_db, "bits": sensor.detector.bits}
     camera.stop()
     warm_up()  # before the laser is on: the first image would hold up the frames after it
     stage.move_to(passes[0][0], feed_mm_per_min=plan.stage.feed_mm_per_min)
     offset_s, encoder = _compare_clocks(camera, **settings)
     at_rest_mm = stage.position_mm()
-    together = continuous.profiles_per_frame
-    rate_set = camera.configure(**settings, frame_rate_hz=rate_hz, profiles=together).frame_rate_hz
+    rate_set = camera.configure(**settings, frame_rate_hz=rate_hz).frame_rate_hz
     if rate_set is None or abs(rate_set / rate_hz - 1) > 0.01:
         warn(f"the camera takes {rate_set} frames/s where the plan needs {rate_hz:.4g}: steps differ from the plan's")
-    kinds = {"centre_lines": lines, "moving": True}
-    with CaptureWriter(out, header, dtype=dtype, **kinds, plan=plan.make_record(), overwrite=overwrite) as writer:
-        frame_s, within = 1e-3 * exposure_ms + together / rate_hz, (min(positions), max(positions))
+    with CaptureWriter(out, header, dtype=dtype, moving=True, plan=plan.make_record(), overwrite=overwrite) as writer:
+        frame_s, within = 1e-3 * exposure_ms + 1.0 / rate_hz, (min(positions), max(positions))
         braking_s = continuous.speed_mm_per_s / stage.settings.acceleration_mm_per_s2
 
         def stored(frame: Frame, stripe: Stripe, number: int) -> None:
@@ -260,11 +258,11 @@ class _FrameReader:
                 continue
             encoder = None if frame.encoder is None else float(frame.encoder)
             exposure_ms = self._exposure_ms if frame.exposure_ms is None else frame.exposure_ms
-            kept = Frame(frame.seen, place, True, exposure_ms, middle_s - self._began_s, encoder=encoder)
+            kept = Frame(frame.image, place, True, exposure_ms, middle_s - self._began_s, encoder=encoder)
             self._writer.append(kept)
             header = self._writer.header
             along, full_dn = header.sensor.camera.stripe_along, header.saturation_dn
-            stripe = find_stripe(frame.seen, stripe_along=along, saturation=full_dn)
+            stripe = extract_stripe(frame.image, stripe_along=along, saturation=full_dn)
             self._stripes.append(stripe.centre_px)
             self._times.append(middle_s)
             self._encoders.append(np.nan if encoder is None else encoder)

@@ -13,7 +13,6 @@ import numpy as np
 from uwlts.fitting.least_squares import robust_std
 from uwlts.hardware.rig import are_enough, get_stripe
 from uwlts.model.sensor import Sensor
-from uwlts.storage.capture import Seen
 from uwlts.stripe import Stripe, StripeStatus
 from uwlts.stripe.capture_stripes import FEWEST_LINES
 
@@ -28,16 +27,12 @@ def select_evenly(positions_mm: Sequence[float], count: int) -> list[float]:
     return [positions_mm[k] for k in chosen]
 
 
-def shows_laser(lit: Seen, unlit: Seen, sensor: Sensor, *, difference: bool) -> bool:
+def shows_laser(lit: np.ndarray, unlit: np.ndarray, sensor: Sensor, *, difference: bool) -> bool:
     """Return whether an image has a stripe that the image (H, W) at the same position without laser does not have.
 
-    The same applies to two centre lines. With ``difference`` the stripe is extracted from the difference. Otherwise
+    With ``difference`` the stripe is extracted from the difference. Otherwise
     it must also be in the image itself, because a lamp that is on only while the laser is off leaves a difference.
     """
-    if isinstance(lit, Stripe) or isinstance(unlit, Stripe):
-        with_laser, without = (select_centres(get_stripe(each, sensor)) for each in (lit, unlit))
-        changed = np.isfinite(with_laser) & ~(np.abs(with_laser - without) < _SAME_PX)
-        return are_enough(int(changed.sum()), len(changed))
     full = sensor.detector.full_scale_dn()
     added = get_stripe(lit, sensor, background=unlit)
     shown = added.status == StripeStatus.OK

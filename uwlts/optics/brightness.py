@@ -192,11 +192,9 @@ def fit_brightness_slopes(
     """Return the slopes (N,) of the log stripe amplitude per mm of stage travel, 0 where they are unknown.
 
     Each slope belongs to a plane fitted to the log amplitudes of neighbouring lines and images. The fit averages noise
-    and speckle. All slopes are 0 if an amplitude is not finite, because the 3D camera does not supply it. Images are at
-    stage positions (F,) in any order. If one of their exposures (F,) is unknown (0), all are assumed equal.
+    and speckle. Images are at stage positions (F,) in any order. If one of their exposures (F,) is unknown (0), all are
+    assumed equal.
     """
-    if not np.isfinite(amplitude).all():
-        return np.zeros(len(frame))
     there = np.bincount(frame, minlength=len(stage_mm)) > 0
     order = np.argsort(stage_mm, kind="stable")
     order = order[there[order]]
@@ -259,14 +257,9 @@ def estimate_blur_shift_px(
 
 
 def select_sharp_lines(stripes: CaptureStripes) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indices (M,) of stripe centres that blur shifts by less than 0.1 px, and their largest shifts, px.
-
-    If an amplitude or width is not finite, because the 3D camera does not supply it, return all centres with shift 0.
-    """
+    """Return the indices (M,) of stripe centres that blur shifts by less than 0.1 px, and their largest shifts, px."""
     if len(stripes.line) == 0:
         return np.empty(0, np.intp), np.empty(0)
-    if not (np.isfinite(stripes.amplitude).all() and np.isfinite(stripes.width_px).all()):
-        return np.arange(len(stripes.line)), np.zeros(len(stripes.line))
     moved = estimate_blur_shift_px(stripes.frame, stripes.line, stripes.centre_px, stripes.amplitude, stripes.width_px)
     sharp = np.flatnonzero(np.abs(moved) < _MOST_BLUR_PX)
     return sharp, moved[sharp]

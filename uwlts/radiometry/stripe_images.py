@@ -107,8 +107,7 @@ def measure_stripes(
     Runs of lines with more than a few clipped pixels are left out as a whole: to leave out single bright lines would
     make the stripe seem darker.
 
-    Raises CaptureError if fewer than `BLOCKS` groups of centres can be used, or the capture has centre lines instead of
-    images.
+    Raises CaptureError if fewer than `BLOCKS` groups of centres can be used.
     """
     along, full_dn = capture.header.sensor.camera.stripe_along, capture.header.saturation_dn
     core = math.ceil(3 * float(np.nanmedian(stripes.width_px)) / FWHM_PER_SIGMA) + 3
@@ -311,7 +310,7 @@ def _measure_variance(images: np.ndarray) -> np.ndarray:
 
 def _find_repeats(capture: Capture) -> list[np.ndarray]:
     """Return the numbers of successive laser images at the same place and exposure, two or more each."""
-    lit = np.flatnonzero(capture.laser_on & capture.has_image)
+    lit = np.flatnonzero(capture.laser_on)
     moved = (np.diff(capture.stage_mm[lit]) != 0) | (np.diff(capture.exposure_ms[lit]) != 0)
     return [numbers for numbers in np.split(lit, np.flatnonzero(moved) + 1) if len(numbers) > 1]
 

@@ -207,7 +207,6 @@ def capture_lines(capture: Capture) -> list[str]:
         f"capture of the sensor '{header.sensor.name}' in {header.medium_name} "
         f"({_medium(header.medium, header.sensor)})",
         f"{len(capture)} frames of {camera.width_px} x {camera.height_px} pixels, {laser} with the laser on"
-        + (f", {lines_only} of them centre lines" if (lines_only := int((~capture.has_image).sum())) else "")
         + ("" if capture.finished else "; the recording was interrupted"),
     ]
     if len(capture):

@@ -235,25 +235,11 @@ def extract_candidates(
     return found.find_candidates(np.arange(len(found.stripe.status)))
 
 
-def find_stripe(
-    seen: np.ndarray | Stripe, *, stripe_along: str, options: StripeOptions = StripeOptions(), saturation: float | None
-) -> Stripe:
-    """Return the stripe of an image (`extract_stripe`) or of a 3D camera's centre line, without its ends.
-
-    For a 3D camera only `StripeOptions.end_lines` is used.
-    """
-    if isinstance(seen, Stripe):
-        return leave_ends_out(seen, options)
-    return extract_stripe(seen, stripe_along=stripe_along, options=options, saturation=saturation)
-
-
-def direct_stripe_in(
-    seen: np.ndarray | Stripe, *, stripe_along: str, options: StripeOptions, saturation: float
-) -> Stripe:
-    """Return the stripe as `find_stripe`, under the rule `PeakRule.DIRECT` without reflections."""
-    if isinstance(seen, Stripe) or options.peak is not PeakRule.DIRECT:
-        return find_stripe(seen, stripe_along=stripe_along, options=options, saturation=saturation)
-    found = _search_image(seen, stripe_along, options, None, saturation)
+def direct_stripe_in(image: np.ndarray, *, stripe_along: str, options: StripeOptions, saturation: float) -> Stripe:
+    """Return the stripe as `extract_stripe`, under the rule `PeakRule.DIRECT` without reflections."""
+    if options.peak is not PeakRule.DIRECT:
+        return extract_stripe(image, stripe_along=stripe_along, options=options, saturation=saturation)
+    found = _search_image(image, stripe_along, options, None, saturation)
     stripe, rivals = found.stripe, found.find_rivals()
     if rivals is not None:
         stripe = direct_stripe(stripe, rivals, jump_px=found.options.jump_px)
