@@ -96,8 +96,8 @@ def verify(
     ]
     start = time.perf_counter()
     run_jobs(partial(_record, folder, variant), jobs, workers=min(workers, len(jobs)))
-    steps = [] if planned.step is None else ["--step", str(_capture(folder, planned.step))]
-    target, capture = (str(_capture(folder, recording)) for recording in (planned.target, planned.standard))
+    steps = [] if planned.step is None else ["--step", str(_locate(folder, planned.step))]
+    target, capture = (str(_locate(folder, recording)) for recording in (planned.target, planned.standard))
     _run("calibrate", "--air", target, *steps, "--out", str(calibration), fails_as=errors.CalibrationError)
     known = ("--calibration", str(calibration), "--out", str(cloud))
     _run("reconstruct", capture, *known, fails_as=errors.CaptureError)
@@ -108,7 +108,7 @@ def verify(
     return replace(profiles, exposure_ms=exposure, seconds=time.perf_counter() - start)
 
 
-def _capture(folder: Path, recording: PlannedRecording) -> Path:
+def _locate(folder: Path, recording: PlannedRecording) -> Path:
     return folder / f"{recording.name}.h5"
 
 
@@ -118,7 +118,7 @@ def _record(
     """Render a recording to its file with one thread; several recordings are rendered at the same time."""
     recording, options = job
     try:
-        record_on_one_thread(recording.scene, recording.sensor, _capture(folder, recording), variant, options=options)
+        record_on_one_thread(recording.scene, recording.sensor, _locate(folder, recording), variant, options=options)
     except Error as error:
         raise type(error)(f"{recording.scene.title}: {error}") from error
 

@@ -203,12 +203,12 @@ def fit_piece(
     places = turned_back.apply(patches.places_mm - platform - corrections[image, :3]) + platform
     cubes = np.floor(places / (options.held_out_cube * survey.radius_mm)).astype(np.int64)
     held_out = (cubes @ np.array([1, 2, 3])) % options.held_out_every == 0
-    slopes = _time_gradients(places, times, 2 * survey.radius_mm)
+    slopes = _fit_time_gradients(places, times, 2 * survey.radius_mm)
     piece = Piece(part, patches, np.empty(0), places, times, slopes, platform, survey.velocity_mm_s[image], held_out)
     return replace(piece, back=np.linalg.inv(piece.around(corrections[image], rates[image])))
 
 
-def _time_gradients(places: np.ndarray, times: np.ndarray, reach_mm: float) -> np.ndarray:
+def _fit_time_gradients(places: np.ndarray, times: np.ndarray, reach_mm: float) -> np.ndarray:
     """Return the gradients (P, 3), s/mm, of times (P,) over places (P, 3), from their neighbours."""
     pairs = KDTree(places).query_pairs(reach_mm, output_type="ndarray")
     first, second = np.vstack([pairs, pairs[:, ::-1]]).T

@@ -216,7 +216,7 @@ class ScanService:
         if isinstance(self._source, Path):
             work, text = self._play, f"playing {self._source.name}"
         else:
-            path = self._free_path(self._source.title)
+            path = self._find_free_path(self._source.title)
             check_fits(self._source.header(path.stem), self._calibration, source=path.name)
             work, text = lambda: self._record(path), f"recording {path.name}"
         self._stop.clear()
@@ -262,7 +262,7 @@ class ScanService:
         self.state.level = "warning"
         self._report(f"warning: {text}")
 
-    def _free_path(self, title: str) -> Path:
+    def _find_free_path(self, title: str) -> Path:
         name = "".join(sign if sign.isalnum() else "-" for sign in title.lower())
         paths = (self._folder / f"{name}-{number:03}.h5" for number in count(1))
         return next(path for path in paths if not (path.exists() or part_path(path).exists()))

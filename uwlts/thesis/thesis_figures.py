@@ -263,7 +263,7 @@ def _measure(
         if scans:
             yield name, "mean SSE", error_mm
     if len(scans) > 1:
-        deviation = max(_spread_mm(capture, calibration) for capture in spheres)
+        deviation = max(_find_spread_mm(capture, calibration) for capture in spheres)
         budget = spacing_budget(calibration, scans, spheres[0].header.medium, deviation_mm=deviation)
         yield from ((BUDGET, name, value) for name, value in budget.items() if math.isfinite(value))
     for capture in lines:
@@ -272,7 +272,7 @@ def _measure(
         yield capture.path.stem, "line length", float(np.ptp(cloud.points_mm[:, 1]))
 
 
-def _spread_mm(capture: Capture, calibration: Calibration) -> float:
+def _find_spread_mm(capture: Capture, calibration: Calibration) -> float:
     """Return the largest standard deviation of points about the spheres of a scan, with the thesis's stripes."""
     stripes = find_stripes(capture, options=_LOW_PASS)
     standard = SphereStandard.model_validate(capture.header.artefact)
