@@ -53,7 +53,6 @@ from uwlts.storage.image_file import read_image
 from uwlts.storage.import_.camera_files import read_intrinsics, set_intrinsics
 from uwlts.storage.import_.folder_description import capture_header, described_sensor, read_description, read_header
 from uwlts.storage.import_.matching import read_rows
-from uwlts.storage.mesh_file import read_mesh
 from uwlts.storage.mount_files import read_mount, read_profiles
 from uwlts.storage.pose_files import read_trajectory
 from uwlts.storage.truth import read_truth, write_truth
@@ -315,8 +314,7 @@ def _surface(path: Path) -> None:
 
 
 def _read_surface(path: Path) -> None:
-    """Read a mesh as a result and as a reference of a comparison."""
-    read_mesh(path)
+    """Read a mesh as a reference of a comparison."""
     # Large discs have few samples, whose memory has its own limit.
     read_reference(path, unit="mm", disc_mm=1e9)
 

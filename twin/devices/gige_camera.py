@@ -237,7 +237,7 @@ class GigeCamera:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as guard:
             guard.bind(("255.255.255.255", PORT))
             with tempfile.NamedTemporaryFile(suffix=".xml") as features:
-                features.write(self._features())
+                features.write(self._describe_features())
                 features.flush()
                 interface, name = LOOPBACK.encode(), features.name.encode()
                 self._server = library.arv_gv_fake_camera_new_full(interface, _SERIAL, name)
@@ -272,7 +272,7 @@ class GigeCamera:
         library.arv_fake_camera_set_trigger_frequency(self._camera, _LOOKS_FOR_TRIGGER_HZ)
         library.arv_fake_camera_set_fill_pattern(self._camera, self._callback, None)
 
-    def _features(self) -> bytes:
+    def _describe_features(self) -> bytes:
         """Return the XML of the camera's features: Aravis's fake camera, with those of an encoder if it has one."""
         library, size = self._library, c_size_t()
         usual = library.arv_fake_camera_new(_SERIAL)
