@@ -152,7 +152,7 @@ def _followed(out: Path, record: Callable[[], Recorded]) -> Recorded:
 
 
 def _follow(out: Path, ready: multiprocessing.synchronize.Event, result: multiprocessing.connection.Connection) -> None:
-    """Follow a recording as `uwlts watch` does, without a browser."""
+    """Follow a recording and show its images on a board, without a browser."""
     sensor = load_sensor("thesis")
     calibration = nominal_calibration(sensor, sensor.medium("air"))
     moments: list[float] = []

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from scipy.stats import median_abs_deviation, norm
+from scipy import special
 
 from twin.design.designs import HighlightedDesign
 from twin.design.figures_of_merit import compute_figures, predict_scatter
@@ -161,7 +161,7 @@ def _measure_profile(points_yz: np.ndarray) -> tuple[float, float, float]:
         trend = np.polynomial.Polynomial.fit(y, z, 2)
         off = points_yz[:, 1] - trend(points_yz[:, 0])
         off -= np.median(off)
-        used = points_yz[np.abs(off) <= _LARGEST_RESIDUAL * median_abs_deviation(off, scale=float(norm.ppf(0.75)))]
+        used = points_yz[np.abs(off) <= _LARGEST_RESIDUAL * np.median(np.abs(off)) / special.ndtri(0.75)]
     y, z = used.T
     residuals = z - np.polynomial.Polynomial.fit(y, z, 2)(y)
     return float(np.sqrt(residuals @ residuals / (len(y) - 3))), float(z.mean()), float(np.ptp(y))

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy import special
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from uwlts.errors import EvaluationError
 from uwlts.fitting.patches import Patches, find_disc_radius, surface_patches
@@ -76,7 +76,7 @@ class AlignmentOptions:
     @property
     def gate(self) -> float:
         """Squared Mahalanobis distance in six dimensions with the same probability as ``search_sigmas`` in one."""
-        return float(chi2.ppf(chi2.cdf(self.search_sigmas**2, 1), 6))
+        return float(special.chdtri(6, special.chdtrc(1, self.search_sigmas**2)))
 
 
 _FEWEST_POINTS = 200  # least number of points of a piece with patches

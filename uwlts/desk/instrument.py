@@ -22,10 +22,10 @@ import numpy as np
 from uwlts.calibration.calibrate import calibrate
 from uwlts.desk.guided import guide
 from uwlts.desk.guided_plan import GuidedPlan
-from uwlts.desk.guided_screen import BoardScreen, Ended, darken
+from uwlts.desk.guided_screen import BoardScreen, darken
 from uwlts.desk.laser_switch import LaserSwitch
 from uwlts.desk.recording_view import BackgroundView, RecordingView
-from uwlts.desk.shown_state import Board, FrameProfile, Picture
+from uwlts.desk.shown_state import Board, Ended, FrameProfile, Picture
 from uwlts.errors import DescriptionError, Error, HardwareError
 from uwlts.hardware.camera_interface import CameraDevice, GrabbedFrame
 from uwlts.hardware.continuous import ScanListeners

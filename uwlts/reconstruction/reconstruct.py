@@ -378,8 +378,8 @@ def _time_rows_s(capture: Capture | FrameTable, stripes: CaptureStripes) -> np.n
 
 
 def _describe_footprint(capture: Capture | FrameTable, sheet: IlluminatedPoints, stripes: CaptureStripes) -> Table:
-    """Return metadata on the footprint of a point on the surface; empty if unknown."""
-    if not np.isfinite(stripes.width_px[sheet.found.status == RayStatus.OK]).any():
+    """Return metadata on the footprint of a point on the surface; empty without a point."""
+    if not (sheet.found.status == RayStatus.OK).any():
         return {}
     std = footprint_std(capture.header.sensor.uncertainty)
     return {FOOTPRINT: list(sheet.footprint_mm(stripes.width_px)), FOOTPRINT_STD: std}
