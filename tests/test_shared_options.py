@@ -29,7 +29,6 @@ MEANING = {
         "--distortion": "Distortion coefficients to estimate",
         "--folder": "Folder",
         "--home": "Home the stage first",
-        "--host": "Address of the page",
         "--index": "[Rr]efractive index",
         "--kind": "Kind of the object",
         "--medium": "One of the sensor's media",

@@ -136,7 +136,7 @@ def find_air_evidence(
             )
     if not images:
         why = _explain_missing_target(captures, targets[0], reasons)
-        raise CalibrationError(f"the target was found in no image of {_names(captures)}: {why}")
+        raise CalibrationError(f"the target was found in no image of {_list_names(captures)}: {why}")
     names = [capture.path.name for capture in captures]
     no_stripe = "" if any(map(len, stripes)) else explain_captures_without_stripe(captures)
     return AirEvidence(targets[0], images, frames, stripes, warnings, no_stripe, outliers, names)
@@ -221,8 +221,8 @@ def explain_captures_without_stripe(captures: Sequence[Capture]) -> str:
     """Return the reason why no stripe was found in captures; for captures of a target, none on the target."""
     header, count = captures[0].header, sum(int(np.count_nonzero(capture.laser_on)) for capture in captures)
     if not count:
-        return f"{_names(captures)}: no image with the laser on; take one at every position"
-    along, where = header.sensor.camera.stripe_along, f"laser images of {_names(captures)}"
+        return f"{_list_names(captures)}: no image with the laser on; take one at every position"
+    along, where = header.sensor.camera.stripe_along, f"laser images of {_list_names(captures)}"
     lit = [image for capture in captures for image in _choose_laser_images(capture, _LOOKED_AT)]
     full_dn = header.saturation_dn
     if any(find_stripe_direction(image, stripe_along=along, saturation=full_dn) == "along" for image in lit):
@@ -231,7 +231,7 @@ def explain_captures_without_stripe(captures: Sequence[Capture]) -> str:
     return f"no stripe in any of the {count} {where}: {reason}"
 
 
-def _names(captures: Sequence[Capture]) -> str:
+def _list_names(captures: Sequence[Capture]) -> str:
     return ", ".join(capture.path.name for capture in captures)
 
 

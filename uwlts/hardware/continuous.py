@@ -250,7 +250,7 @@ class _FrameReader:
         known = [each for one in list(self._passes) for each in list(one)]
         if not known:
             return
-        times, places = np.array([_time_of(each) for each in known]), [each.position_mm for each in known]
+        times, places = np.array([_date(each) for each in known]), [each.position_mm for each in known]
         while self._pending and (self._pending[0][1] < times[-1] or self.end_s is not None):
             frame, middle_s = self._pending.popleft()
             place = float(np.interp(middle_s, times, places))
@@ -289,7 +289,7 @@ class _FrameReader:
             )
         stage, speed, scatters, speeds = np.full(len(times), np.nan), np.zeros(len(times)), [], []
         for one in self._passes:
-            within = (times >= _time_of(one[0])) & (times <= _time_of(one[-1])) if one else np.zeros(len(times), bool)
+            within = (times >= _date(one[0])) & (times <= _date(one[-1])) if one else np.zeros(len(times), bool)
             if not within.any():
                 continue
             constant = [each for each in one if even[0] <= each.position_mm <= even[1]]
@@ -312,7 +312,7 @@ class _FrameReader:
             except EvaluationError as error:
                 warn(f"the latency of the stage is unknown and taken as 0: {error}")
         stage = stage + speed * latency_s
-        reports = [(_time_of(each) - self._began_s, each.position_mm) for one in self._passes for each in one]
+        reports = [(_date(each) - self._began_s, each.position_mm) for one in self._passes for each in one]
         self._writer.place(stage, speed, np.array(reports))
         known = "as given" if std_s is None else f"measured, std {1e3 * std_s:.3f} ms"
         return (
@@ -321,7 +321,7 @@ class _FrameReader:
         )
 
 
-def _time_of(report: StageReport) -> float:
+def _date(report: StageReport) -> float:
     return 0.5 * (report.asked_s + report.answered_s)
 
 
@@ -340,7 +340,7 @@ def _fit_line(reports: list[StageReport], at_s: np.ndarray) -> tuple[np.ndarray,
     took = np.sort([each.answered_s - each.asked_s for each in reports])
     longest = max(_SLOW_REPORT * took[0], took[max(len(reports) // 2, _FEWEST_REPORTS - 1)])
     used = [each for each in reports if each.answered_s - each.asked_s <= longest]
-    times, places = np.array([_time_of(each) for each in used]), np.array([each.position_mm for each in used])
+    times, places = np.array([_date(each) for each in used]), np.array([each.position_mm for each in used])
     middle, kept, speed, start = times.mean(), np.ones(len(used), bool), 0.0, 0.0
     outside, fitted = places, kept
     for _ in range(3):

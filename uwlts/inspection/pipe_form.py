@@ -240,7 +240,7 @@ def pipe_features(cloud: PointCloud, form: PipeForm) -> tuple[list[Feature], lis
 
 def _make_whole_values(form: PipeForm, errors: PointErrors) -> tuple[FeatureValue, ...]:
     kind, used, coefficients, diameter = FeatureKind.PIPE, form.used, form.coefficients, 2 * form.radius_mm
-    random, common = errors.covariances(form.weights, form.distance_mm[used], _neighbourhoods(form, used))
+    random, common = errors.covariances(form.weights, form.distance_mm[used], _number_sectors(form, used))
     if not form.is_seen_round:
         by_ovality = form.weights @ _bound_unseen_ovality(form, used)
         common = by_ovality @ by_ovality.T + (0.0 if common is None else common)
@@ -309,7 +309,7 @@ def _measure_arc_diameter(
     by_axis = weights @ _make_design(form.along_mm[members], form.angle[members], form.scale_mm, form.terms)[:, moved]
     whole = -by_axis @ form.weights[moved]
     whole[inside] += weights
-    random, common = errors.covariances(whole[None], form.distance_mm[form.used], _neighbourhoods(form, form.used))
+    random, common = errors.covariances(whole[None], form.distance_mm[form.used], _number_sectors(form, form.used))
     by_ovality = whole @ _bound_unseen_ovality(form, form.used)
     common = np.array([[by_ovality @ by_ovality]]) + (0.0 if common is None else common)
     diameter = 2 * (form.radius_mm + off)
@@ -326,7 +326,7 @@ def _bound_unseen_ovality(form: PipeForm, points: np.ndarray) -> np.ndarray:
     return std * np.column_stack([np.cos(2 * form.angle[points]), np.sin(2 * form.angle[points])])
 
 
-def _neighbourhoods(form: PipeForm, used: np.ndarray) -> np.ndarray:
+def _number_sectors(form: PipeForm, used: np.ndarray) -> np.ndarray:
     """Return the neighbourhood (K,) of each point: sectors of 5 deg by twelfths of the length."""
     along = form.along_mm[used]
     row = np.floor((along - along.min()) / max(float(np.ptp(along)), 1e-9) * (FORM_RULE.lengths - 1e-3)).astype(

@@ -104,11 +104,11 @@ def certificate_page(
         parameters=_list_parameters(content.parameters, before),
         before=None if before is None else before[0],
         lengths=_list_lengths(content.lengths),
-        drawn=_pictures(content, calibration, before),
+        drawn=_draw(content, calibration, before),
     )
 
 
-def _pictures(content: Certificate, calibration: Calibration, before: tuple[str, Calibration] | None) -> dict[str, Any]:
+def _draw(content: Certificate, calibration: Calibration, before: tuple[str, Calibration] | None) -> dict[str, Any]:
     """Return the charts of the page by name.
 
     ``worst`` are the images with the largest residuals relative to their kind.

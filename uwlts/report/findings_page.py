@@ -417,8 +417,8 @@ def _make_maps(
     pipe = next((each for each in found.features if each.kind == FeatureKind.PIPE), None)
     labels = ["X / mm", "Y / mm"] if pipe is None else ["along the axis / mm", "around the circumference / mm"]
     middle = cloud.points_mm.mean(axis=0)
-    at = _map_coordinates(cloud.points_mm, pipe, middle)
-    marks = _map_coordinates(np.array([each.place_mm for each in parts]).reshape(-1, 3), pipe, middle)
+    at = _compute_map_coordinates(cloud.points_mm, pipe, middle)
+    marks = _compute_map_coordinates(np.array([each.place_mm for each in parts]).reshape(-1, 3), pipe, middle)
     ends = [(side.min(), side.max()) for side in at]
     if pipe:
         ends[1] = -np.pi * pipe["diameter"].value / 2, np.pi * pipe["diameter"].value / 2
@@ -435,7 +435,7 @@ def _make_maps(
     height = 7.2 * float(np.ptp(at[1]) / max(np.ptp(at[0]), 1e-9))
     figure, (axes,) = new_figure(8.0, height + 1.5)
     size = float(np.clip(1.5 * height * 7.2 * 72**2 / max(len(shown), 1), 1, 60))
-    colours = axes.scatter(*at[:, shown], c=found.deviation_mm[shown], rasterized=True, s=size, **_colour_scale(found))
+    colours = axes.scatter(*at[:, shown], c=found.deviation_mm[shown], rasterized=True, s=size, **_scale_colour(found))
     figure.colorbar(colours, ax=axes, label="above the undamaged surface / mm", orientation="horizontal", aspect=50)
     for each, place in zip(parts, marks.T, strict=True):
         colour = _VERDICT_COLOURS[judge_feature(each, order.limits)[0]]
@@ -459,7 +459,7 @@ def _make_maps(
     return png_data_uri(figure, dpi=130), png_data_uri(seen, dpi=110), said
 
 
-def _colour_scale(found: Inspection) -> dict[str, Any]:
+def _scale_colour(found: Inspection) -> dict[str, Any]:
     """Return the one scale of the map and of all pictures of findings."""
     limit = surface_limit_mm(found.deviation_mm)
     return {"cmap": DEVIATIONS, "vmin": -limit, "vmax": limit, "linewidths": 0}
@@ -478,7 +478,7 @@ def _state_point_accuracy(cloud: PointCloud) -> list[str] | None:
     return [format_to_scale(each, typical[0]) for each in (*typical, float(np.quantile(every, COVERAGE)))]
 
 
-def _map_coordinates(points: np.ndarray, pipe: Feature | None, middle: np.ndarray) -> np.ndarray:
+def _compute_map_coordinates(points: np.ndarray, pipe: Feature | None, middle: np.ndarray) -> np.ndarray:
     """Return map coordinates (2, N) of points: along and around a pipe, centred at ``middle`` (3,), else X and Y."""
     if pipe is None:
         return points[:, :2].T
@@ -498,7 +498,7 @@ def _plot_finding(feature: Feature, found: Inspection, cloud: PointCloud) -> str
     local, deviation = local[near], found.deviation_mm[near]
     figure, (above, cut) = new_figure(7.4, 2.4, columns=2)
     size = float(np.clip(25_000 / max(len(local), 1), 2, 40))
-    colours = above.scatter(local[:, 0], local[:, 1], c=deviation, s=size, **_colour_scale(found))
+    colours = above.scatter(local[:, 0], local[:, 1], c=deviation, s=size, **_scale_colour(found))
     figure.colorbar(colours, ax=above, label="deviation / mm")
     for other in found.select(*BLEMISHES):
         outline = (other.outline_mm - feature.place_mm) @ feature.axes.T
