@@ -165,7 +165,7 @@ def choose(
         missed = one.figure("violation")[0]
         return bool(missed <= winner.design.violation and one.cost()[0] < known - 1e-6 * abs(known))
 
-    if study.refine and (end := refine_design(study, winner.design.without_results(), better)) is not None:
+    if (end := refine_design(study, winner.design.without_results(), better)) is not None:
         marked.append(
             HighlightedDesign(
                 "refined along the gradient", build_sensor(study, end), select_design(evaluate_designs(study, [end]), 0)

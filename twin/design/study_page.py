@@ -295,7 +295,7 @@ def page_text(
         number=tables.number_text,
         value=tables.value_text,
         verdicts=[
-            (found, tables.agreement_text(study, found), drawn and (figure_svg(drawn[0]), drawn[1]))
+            (found, tables.agreement_text(found), drawn and (figure_svg(drawn[0]), drawn[1]))
             for found in agreements
             for drawn in [verification_chart(found)]
         ],
