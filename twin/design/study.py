@@ -118,8 +118,8 @@ class Study(Description):
     ``sensor`` is the base sensor, given by name, path or table. It is stored completely, because remote workers may not
     have its file. ``variables`` are free values of the sensor's description by path (``camera.focal_length_mm``).
     ``choices`` are named alternatives that set several paths at once, such as commercial cameras. ``follow`` lists the
-    adjustments to each design's stand-off, see `twin.design.sensor_arrays.compute_adjustments`. ``verify`` is the number
-    of designs to render, in addition to the base sensor.
+    adjustments to each design's stand-off, see `twin.design.sensor_arrays.compute_adjustments`. ``verify`` is the
+    number of designs to render, in addition to the base sensor.
     """
 
     title: str

@@ -77,13 +77,10 @@ def number_text(value: float | None, digits: int = 4) -> str:
     """Format a number with significant digits and a minus sign; a dash if it is missing or not finite."""
     if value is None or not math.isfinite(value):
         return MISSING
-    if float(value).is_integer() and abs(value) < 1e6:
+    if float(value).is_integer():
         text = f"{value:.0f}"
     else:
-        text = f"{value:.{digits}g}"
-        # Scientific notation is only for values outside the range of any sensor.
-        if "e" in text and 1e-6 < abs(value) < 1e9:
-            text = f"{value:.0f}" if abs(value) >= 1 else f"{value:.{digits + 5}f}".rstrip("0")
+        text = np.format_float_positional(value, precision=digits, unique=False, fractional=False, trim="-")
     return text.replace("-", "\N{MINUS SIGN}")
 
 

@@ -229,11 +229,9 @@ def compare_scatter(study: Study, candidate: HighlightedDesign, rendered: Verifi
     return Agreement(
         candidate.label,
         candidate.design.number,
-        z_mm=rendered.z_mm.tolist(),
         predicted_mm=predicted.tolist(),
         rendered_mm=rendered.scatter_mm.tolist(),
-        error_mm=rendered.error_mm.tolist(),
-        line_mm=rendered.line_mm.tolist(),
+        **{name: getattr(rendered, name).tolist() for name in ("z_mm", "error_mm", "line_mm")},
         ratio=factor,
         rendered_over_predicted=ratio,
         agrees=bool(factor <= AGREES_WITHIN),

@@ -32,7 +32,7 @@ from uwlts.errors import CaptureError
 from uwlts.fitting.local_surface import surface_normals
 from uwlts.model.calibration import Calibration
 from uwlts.model.placement import LaserPose, apparent_depth_mm, laser_pose
-from uwlts.model.sensor import Camera, CaptureHeader, Laser, Sensor, Window
+from uwlts.model.sensor import CaptureHeader, Laser, Sensor, Window
 from uwlts.model.stripe import CaptureStripes, stack_pixels
 from uwlts.optics.camera import directions
 from uwlts.optics.design import WindowGeometry, length_outside_mm, trace_to_points

@@ -483,7 +483,6 @@ def test_results_of_another_study_are_refused(swept):
 
 
 def test_verdicts():
-    study = small()
     assert agreement_text(verification()).startswith("Formulas and rendering agree")
     assert "no marks" in agreement_text(verification(failure="no marks", agrees=False))
     lost = verification(agrees=False, ratio=math.nan, rendered_mm=[math.nan] * 3)
