@@ -47,7 +47,6 @@ MEANING = {
         "--pose-unit": "Unit of the .*positions",
         "--poses": "[Pp]ose",
         "--resume": "[Cc]ontinue an (earlier|interrupted)",
-        "--section-mm": "section",
         "--sensor": "sensor description",
         "--stage": "[Ss]erial port of (the|a) stage",
         "--step": "step standard",

@@ -271,8 +271,8 @@ def _check_row(figure: Figure) -> tuple[str, ...]:
     expanded = figure.expanded_uncertainty_mm
     fine = expanded or _SMALLEST_MM
     calibrated = MISSING if figure.calibrated_mm is None else f"{figure.calibrated_mm:g}"
-    stated = MISSING if expanded is None else format_to_scale(expanded, fine, digits=2)
-    return figure.key.name.replace("_", " "), calibrated, format_to_scale(figure.value_mm, fine, digits=2), stated
+    stated = MISSING if expanded is None else format_to_scale(expanded, fine)
+    return figure.key.name.replace("_", " "), calibrated, format_to_scale(figure.value_mm, fine), stated
 
 
 def _render(
@@ -315,7 +315,7 @@ def _render(
         by_hand=None if by_hand is None else (COLUMNS, [each.row() for each in by_hand.values]),
         maps=_make_maps(found, cloud, parts, order),
         accuracy=_state_point_accuracy(cloud),
-        depths=[format_to_scale(each, each, digits=2) for each in dict.fromkeys((*depths[:1], *depths[-1:]))],
+        depths=[format_to_scale(each, each) for each in dict.fromkeys((*depths[:1], *depths[-1:]))],
         pictures=[
             (each.title, judge_feature(each, order.limits)[0], _plot_finding(each, found, cloud)) for each in drawn
         ],
@@ -378,24 +378,19 @@ def format_interval(value: FeatureValue) -> str:
     half = COVERAGE_FACTOR * value.uncertainty
     if value.bound:
         text, number = value.bound
-        return f"{text} {format_to_scale(number, max(half, _SMALLEST_MM), digits=2)}"
+        return f"{text} {format_to_scale(number, max(half, _SMALLEST_MM))}"
     if half <= _SMALLEST:
         return f"{value.value:.4g}"
-    shown = format_to_scale(value.value, half, digits=2)
+    shown = format_to_scale(value.value, half)
     if value.low > value.value - 0.9 * half:
         # The interval of a non-negative value is asymmetric.
-        return (
-            f"{shown} ({format_to_scale(value.low, half, digits=2)} to {format_to_scale(value.high, half, digits=2)})"
-        )
-    return f"{shown} ± {format_to_scale(half, half, digits=2)}"
+        return f"{shown} ({format_to_scale(value.low, half)} to {format_to_scale(value.high, half)})"
+    return f"{shown} ± {format_to_scale(half, half)}"
 
 
 def _make_value_row(value: FeatureValue) -> tuple[str, ...]:
     parts = value.random, value.systematic
-    fine = [
-        MISSING if part is None else format_to_scale(part, part, digits=2) if part > _SMALLEST else "0"
-        for part in parts
-    ]
+    fine = [MISSING if part is None else format_to_scale(part, part) if part > _SMALLEST else "0" for part in parts]
     return value.name, value.unit, format_interval(value), *fine
 
 
@@ -480,7 +475,7 @@ def _state_point_accuracy(cloud: PointCloud) -> list[str] | None:
         return None
     every = COVERAGE_FACTOR * np.hypot(random, common)
     typical = [float(np.median(each)) for each in (every, COVERAGE_FACTOR * random, COVERAGE_FACTOR * common)]
-    return [format_to_scale(each, typical[0], digits=2) for each in (*typical, float(np.quantile(every, COVERAGE)))]
+    return [format_to_scale(each, typical[0]) for each in (*typical, float(np.quantile(every, COVERAGE)))]
 
 
 def _compute_map_coordinates(points: np.ndarray, pipe: Feature | None, middle: np.ndarray) -> np.ndarray:
