@@ -282,7 +282,7 @@ def evaluate_field(xp: ModuleType, p: SensorArrays, depth_mm: Array, places: Arr
     )
 
 
-def _figure(text: str, unit: str = "mm") -> Any:
+def _label(text: str, unit: str = "mm") -> Any:
     """Return a field of `Figures` with its label and unit for pages."""
     return field(metadata={"words": text, "unit": unit})
 
@@ -300,39 +300,39 @@ class Figures:
     middle of the volume.
     """
 
-    sigma_x_mm: np.ndarray = _figure("σ X, by the stage")
-    sigma_y_mm: np.ndarray = _figure("σ Y, largest in the volume")
-    sigma_z_mm: np.ndarray = _figure("σ Z, largest in the volume")
-    sigma_z_rms_mm: np.ndarray = _figure("σ Z, rms over the volume")
-    sigma_z_near_mm: np.ndarray = _figure("σ Z at the near end")  # root mean squares along the stripe
-    sigma_z_middle_mm: np.ndarray = _figure("σ Z in the middle")
-    sigma_z_far_mm: np.ndarray = _figure("σ Z at the far end")
-    depth_per_px_mm: np.ndarray = _figure("depth per pixel", "mm/px")
-    along_per_px_mm: np.ndarray = _figure("length along the stripe per pixel", "mm/px")
-    coverage: np.ndarray = _figure("fraction of the volume in reach", "")  # of camera and laser
-    standoff_mm: np.ndarray = _figure("stand-off")  # where the sheet crosses the camera's axis
-    near_mm: np.ndarray = _figure("near end of the volume")
-    far_mm: np.ndarray = _figure("far end of the volume")
-    depth_mm: np.ndarray = _figure("depth of the volume")
-    line_near_mm: np.ndarray = _figure("line length at the near end")
-    line_mm: np.ndarray = _figure("line length in the middle")
-    line_far_mm: np.ndarray = _figure("line length at the far end")
-    section_cm2: np.ndarray = _figure("area of the sheet in the volume", "cm²")  # that the camera sees
+    sigma_x_mm: np.ndarray = _label("σ X, by the stage")
+    sigma_y_mm: np.ndarray = _label("σ Y, largest in the volume")
+    sigma_z_mm: np.ndarray = _label("σ Z, largest in the volume")
+    sigma_z_rms_mm: np.ndarray = _label("σ Z, rms over the volume")
+    sigma_z_near_mm: np.ndarray = _label("σ Z at the near end")  # root mean squares along the stripe
+    sigma_z_middle_mm: np.ndarray = _label("σ Z in the middle")
+    sigma_z_far_mm: np.ndarray = _label("σ Z at the far end")
+    depth_per_px_mm: np.ndarray = _label("depth per pixel", "mm/px")
+    along_per_px_mm: np.ndarray = _label("length along the stripe per pixel", "mm/px")
+    coverage: np.ndarray = _label("fraction of the volume in reach", "")  # of camera and laser
+    standoff_mm: np.ndarray = _label("stand-off")  # where the sheet crosses the camera's axis
+    near_mm: np.ndarray = _label("near end of the volume")
+    far_mm: np.ndarray = _label("far end of the volume")
+    depth_mm: np.ndarray = _label("depth of the volume")
+    line_near_mm: np.ndarray = _label("line length at the near end")
+    line_mm: np.ndarray = _label("line length in the middle")
+    line_far_mm: np.ndarray = _label("line length at the far end")
+    section_cm2: np.ndarray = _label("area of the sheet in the volume", "cm²")  # that the camera sees
     # Largest angle between laser's and camera's rays: steeper walls hide one from the other.
-    occlusion_deg: np.ndarray = _figure("occlusion angle, largest", "°")
+    occlusion_deg: np.ndarray = _label("occlusion angle, largest", "°")
     # Scattering coefficient times the path from laser to camera: mean number of scatterings of the light.
-    scattering_depth: np.ndarray = _figure("optical depth of scattering, largest", "")
-    signal_e: np.ndarray = _figure("faintest signal", "e⁻")
-    exposure_ms: np.ndarray = _figure("exposure", "ms")  # as used
-    required_ms: np.ndarray = _figure("exposure required", "ms")  # that the wanted brightness takes
-    stripe_px: np.ndarray = _figure("width of the stripe's image (σ)", "px")  # largest in the volume, as the next two
-    blur_px: np.ndarray = _figure("the lens's blur (σ)", "px")
-    centre_px: np.ndarray = _figure("σ of the stripe's centre", "px")
-    speckle_limit_mm: np.ndarray = _figure("speckle limit of Z")  # Dorsch's, in the middle, for depolarised light
-    laser_class: np.ndarray = _figure("laser class", "")  # number after IEC 60825-1, see `CLASS_NAMES`, `laser_class`
-    window_mm: np.ndarray = _figure("window thickness needed")  # for the pressure at the study's depth
-    window_safety: np.ndarray = _figure("safety factor of the windows", "")  # of the weaker one, at the study's depth
-    baseline_mm: np.ndarray = _figure("width of the sensor")
+    scattering_depth: np.ndarray = _label("optical depth of scattering, largest", "")
+    signal_e: np.ndarray = _label("faintest signal", "e⁻")
+    exposure_ms: np.ndarray = _label("exposure", "ms")  # as used
+    required_ms: np.ndarray = _label("exposure required", "ms")  # that the wanted brightness takes
+    stripe_px: np.ndarray = _label("width of the stripe's image (σ)", "px")  # largest in the volume, as the next two
+    blur_px: np.ndarray = _label("the lens's blur (σ)", "px")
+    centre_px: np.ndarray = _label("σ of the stripe's centre", "px")
+    speckle_limit_mm: np.ndarray = _label("speckle limit of Z")  # Dorsch's, in the middle, for depolarised light
+    laser_class: np.ndarray = _label("laser class", "")  # number after IEC 60825-1, see `CLASS_NAMES`, `laser_class`
+    window_mm: np.ndarray = _label("window thickness needed")  # for the pressure at the study's depth
+    window_safety: np.ndarray = _label("safety factor of the windows", "")  # of the weaker one, at the study's depth
+    baseline_mm: np.ndarray = _label("width of the sensor")
 
 
 FIGURES: dict[str, tuple[str, str]] = {

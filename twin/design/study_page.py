@@ -101,7 +101,7 @@ def _draw_panel(
         figure.update_xaxes(title_text="rank", **at)
     if len(names) == 3:
         marker |= {"color": tables.round_for_json(found), "colorscale": "Viridis", "showscale": True}
-        marker["colorbar"] = _colour_bar(figure, **at)
+        marker["colorbar"] = _lay_out_colour_bar(figure, **at)
     figure.add_scatter(
         x=tables.round_for_json(shown[0]),
         y=tables.round_for_json(shown[-1]),
@@ -120,7 +120,7 @@ def _draw_panel(
             figure.add_hline(bound, line={"color": RED, "dash": "dash"}, **at)
 
 
-def _colour_bar(figure: go.Figure, *, row: int, col: int) -> dict[str, object]:
+def _lay_out_colour_bar(figure: go.Figure, *, row: int, col: int) -> dict[str, object]:
     """Return the layout of the colour bar beside a panel."""
     panel = next(figure.select_xaxes(row=row, col=col)), next(figure.select_yaxes(row=row, col=col))
     across, along = (axis.domain for axis in panel)

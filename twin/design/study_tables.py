@@ -130,17 +130,17 @@ def failure_counts(judged: StudyResults) -> list[tuple[str, str]]:
 
 def bound_text(name: str, sign: int, bound: float) -> str:
     """Format a bound as a text."""
-    return f"{words_of(name)} {_limit(name, sign, bound)}"
+    return f"{words_of(name)} {_describe_limit(name, sign, bound)}"
 
 
-def _limit(name: str, sign: int, bound: float) -> str:
+def _describe_limit(name: str, sign: int, bound: float) -> str:
     return f"{'at most' if sign > 0 else 'at least'} {value_text(name, bound)}"
 
 
 def misses(study: Study, row: Mapping[str, Value | None]) -> dict[str, str]:
     """Return the figures that violate a bound, each with a text of the bound."""
     return {
-        name: f"{_limit(name, sign, bound)} is required"
+        name: f"{_describe_limit(name, sign, bound)} is required"
         for name, sign, bound in study.bounds()
         if isinstance(value := row.get(name), int | float) and sign * (value - bound) > 0
     }

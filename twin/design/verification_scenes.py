@@ -150,7 +150,7 @@ def plan_recordings(sensor: Sensor, medium: str, *, reflectance: float) -> Recor
     wavelength, media = sensor.laser.wavelength_nm, dict(sensor.media)
     if not (sensor.camera.window.mounted and of_use.refractive_index(wavelength) > 1 + 1e-6):
         return Recordings(_target(calibrated, medium, sight, near=near, far=far, y=y), standard, None)
-    step = PlannedRecording("step", calibrated, _step(medium, near=near, far=far, y=y, length=length))
+    step = PlannedRecording("step", calibrated, _plan_step(medium, near=near, far=far, y=y, length=length))
     air = next(
         (name for name, one in media.items() if one.kind == "air" and one.refractive_index(wavelength) == 1), None
     )
@@ -188,7 +188,7 @@ def find_measured_range(sensor: Sensor, medium: Medium) -> tuple[float, float]:
     return float(lit[0] + margin), float(lit[-1] - margin)
 
 
-def _step(medium: str, *, near: float, far: float, y: float, length: float) -> Scene:
+def _plan_step(medium: str, *, near: float, far: float, y: float, length: float) -> Scene:
     """Plan two blocks side by side along the line, with faces half a step in front of and behind the origin."""
     height = round(_STEP_HEIGHT * (far - near), 3)
     back = 1.5 * height

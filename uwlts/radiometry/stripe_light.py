@@ -120,7 +120,7 @@ def light_at(
         # A ray one pixel further meets the surface at this distance along the ray from its crossing of the sheet.
         shift = -np.vecdot(normal, along) / np.vecdot(normal, ray)
         sheet_per_px = np.abs(slope * shift)
-        grey = _grey_per_radiance(sensor, medium_index) * in_air[:, 2] ** 4 * per_mm * lit / (math.pi * sheet_per_px)
+        grey = _convert_radiance(sensor, medium_index) * in_air[:, 2] ** 4 * per_mm * lit / (math.pi * sheet_per_px)
     across = along - np.vecdot(along, ray)[:, None] * ray
     good = (found.status[:count] == RayStatus.OK) & (found.status[count:] == RayStatus.OK)
     good &= (lit > _GRAZING) & (seen > _GRAZING) & np.isfinite(grey) & (grey > 0)
@@ -166,7 +166,7 @@ def defocus_variance(
     return radius**2 / 4
 
 
-def _grey_per_radiance(sensor: Sensor, index: float) -> float:
+def _convert_radiance(sensor: Sensor, index: float) -> float:
     """Return the grey values per ms, and per radiance in the medium in mW / (mm2 sr), on the lens's axis.
 
     The image irradiance is pi / (4 N^2) L with the working f-number N; a radiance falls by the squared index on its way

@@ -89,7 +89,7 @@ def write_change(
         warnings=change.warnings,
         regions=change.regions()[:_MOST_ROWS],
         more=max(len(change.regions()) - _MOST_ROWS, 0),
-        map=_map(change),
+        map=_draw_map(change),
         histogram=_draw_histogram(change),
     )
     if coloured is not None:
@@ -122,7 +122,7 @@ def _colour_points(change: SurfaceChange) -> np.ndarray:
     return colours
 
 
-def _map(change: SurfaceChange) -> str:
+def _draw_map(change: SurfaceChange) -> str:
     """Plot the points along their two longest extents, coloured if the change is significant."""
     first, second = np.sort(np.argsort(np.ptp(change.points_mm, axis=0), kind="stable")[1:])
     shown, changed = change.compared, change.significant

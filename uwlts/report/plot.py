@@ -204,11 +204,7 @@ def _choose_lines(stripe: Stripe, *, enlarged: bool) -> np.ndarray:
     if not enlarged:
         return stripe.lines
     count = min(_LINES_ENLARGED, len(stripe.lines))
-    # Without amplitudes of a 3D camera, show the part with the most lines.
-    amplitude = (
-        stripe.amplitude if np.isfinite(stripe.amplitude).any() else np.where(np.isfinite(stripe.centre_px), 1, 0)
-    )
-    first = int(np.argmax(np.convolve(np.nan_to_num(amplitude), np.ones(count), mode="valid")))
+    first = int(np.argmax(np.convolve(np.nan_to_num(stripe.amplitude), np.ones(count), mode="valid")))
     return stripe.lines[(stripe.lines >= first) & (stripe.lines < first + count)]
 
 
