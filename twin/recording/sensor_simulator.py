@@ -35,7 +35,7 @@ from twin.sensor.detector import (
 )
 from twin.sensor.speckle import Speckle, coherence
 from uwlts.errors import DesignError
-from uwlts.model.placement import camera_from_object
+from uwlts.model.placement import apparent_depth_mm, camera_from_object
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Frame
 
@@ -384,18 +384,14 @@ class SensorSimulator:
         """Displace the points of a target by its detection errors in this image."""
         for plate, pose in zip(self.scene.objects, self.scene.object_poses(), strict=True):
             if isinstance(plate, PrintedPlate) and plate.detection_std_px > 0:
-                seen = camera_from_object(self.sensor) @ np.linalg.inv(self.pose(shot)) @ pose
-                mm_per_px = self._compute_apparent_depth_mm(seen[2, 3]) / self.sensor.camera.focal_length_px()
+                depth_mm = (camera_from_object(self.sensor) @ np.linalg.inv(self.pose(shot)) @ pose)[2, 3]
+                window, wavelength = self.sensor.camera.window, self.sensor.laser.wavelength_nm
+                if window.mounted:
+                    indices = {"glass_index": window.index(wavelength)}
+                    indices["medium_index"] = self.medium.refractive_index(wavelength)
+                    depth_mm = apparent_depth_mm(depth_mm, window.distance_mm, window.thickness_mm, **indices)
+                mm_per_px = depth_mm / self.sensor.camera.focal_length_px()
                 shift_points(self.renderer.objects.scene, plate, mm_per_px=mm_per_px, image=index)
-
-    def _compute_apparent_depth_mm(self, depth_mm: float) -> float:
-        """Return the apparent depth of a point on the axis: a layer of index n appears n times thinner."""
-        window, wavelength = self.sensor.camera.window, self.sensor.laser.wavelength_nm
-        if not window.mounted:
-            return depth_mm
-        outside = depth_mm - window.distance_mm - window.thickness_mm
-        in_medium = outside / self.medium.refractive_index(wavelength)
-        return window.distance_mm + window.thickness_mm / window.index(wavelength) + in_medium
 
     def _find_exposure(self, light: Light, probe: Literal["scan", "middle"]) -> float:
         """Return the described exposure in ms, or that which brings the brightest shot to the wanted level."""
