@@ -81,7 +81,6 @@ SERVING = {
     "test_gige_camera.py",
     "test_calibrate_live.py",
     "test_scan_command.py",
-    "test_scan_3d.py",
     "test_continuous_scan.py",
     "test_scan_exposure.py",
     "test_scan_ended.py",

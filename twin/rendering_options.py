@@ -101,8 +101,6 @@ class Flaws:
     """Quality of JPEG compression; 8-bit images only."""
     colour_filter: bool = False
     """Colour image sensor (RGGB) instead of a monochrome one; its red channel is recorded."""
-    camera_3d: int = _make_flaw(off=0, typical=16, least=1, most=32)
-    """Steps per pixel of a 3D camera, which detects the stripe itself: laser images are recorded as centre lines."""
 
     def __post_init__(self) -> None:
         for each in fields(self):

@@ -5,7 +5,6 @@ from .calibration.camera.photographs import calibrate_camera as calibrate_camera
 from .calibration.mount.calibrate_mount import calibrate_mount as calibrate_mount
 from .calibration.polynomial.polynomial_calibration import calibrate_polynomials as calibrate_polynomials
 from .comparison.change import compare_clouds as compare_clouds
-from .comparison.surface_mesh import mesh as mesh
 from .desk.scan import scan as scan
 from .doctor import examine as examine
 from .errors import Error as Error
@@ -31,5 +30,4 @@ from .storage.capture import Capture as Capture
 from .storage.cloud import PointCloud as PointCloud
 from .storage.export_ import export as export
 from .storage.import_.folder import import_images as import_images
-from .storage.mesh_file import SurfaceMesh as SurfaceMesh
 from .stripe import StripeOptions as StripeOptions

@@ -128,10 +128,6 @@ JOBS: dict[str, str] = {
             --page register/shapes.html --poses-out register/poses.csv
         uwlts register clouds/shapes.full.ply clouds/shapes-again.full.ply --start-std-mm 0.05 --start-std-deg 0.02 \
             --out register/known.full.ply --page register/known.html""",
-    "mesh": """
-        uwlts mesh clouds/shapes.full.ply --out mesh/shapes.ply
-        uwlts mesh clouds/shapes.full.ply clouds/shapes-again.full.ply --cube-mm 1.5 --patch-radius-mm 3 \
-            --out mesh/both.glb""",
     "align": f"""
         uwlts align inputs/crossing.full.ply --trajectory inputs/crossing.csv {PROFILED} --drift-mm 60 --drift-deg 0.3 \
             --out align/corrected.csv --aligned align/aligned.full.ply""",

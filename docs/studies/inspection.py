@@ -1,9 +1,9 @@
-"""Errors of inspections and meshes of rendered scans; `docs/studies/prediction.py` has the probability of detection.
+"""Errors of inspections of rendered scans; `docs/studies/prediction.py` has the probability of detection.
 
     python docs/studies/inspection.py FOLDER [--write]
 
 Renders the scenes of `inspection_scenes.py` by two draws of sensor, noise, pits and welds, calibrates jointly, and
-compares with the closed form: values of inspections, false claims of change, and meshes.
+compares with the closed form: values of inspections, and false claims of change.
 """
 
 from dataclasses import replace
@@ -24,7 +24,6 @@ from inspection_scenes import (
     record,
     small_pits,
 )
-from rendered_mesh import mesh_table
 from result_tables import publish, table
 from scipy.spatial.transform import Rotation
 
@@ -207,7 +206,7 @@ def main(folder: Path, *, write: bool = False) -> None:
             changes += unchanged_rows(own, water, draw)
     head = ["draw", "water", "pits", "claimed"]
     tables = {"inspected values": table(HEAD, [row for name, some in pairs.items() for row in figure_rows(name, some)])}
-    tables |= {"changes of rendered pipes": table(head, changes), "meshes": mesh_table(folder / str(DRAWS[0]))}
+    tables["changes of rendered pipes"] = table(head, changes)
     publish(tables, write=write)
     if write:
         draw_map(folder / str(DRAWS[0]), PICTURE)

@@ -1,8 +1,7 @@
 """Objects of known shape for the study of inspections, as meshes and scenes, and the campaigns that render them.
 
-The objects are a pipe of 300 mm diameter and 0.5 % ovality, welds, and a thin plate seen from both sides. The
-pipe is smooth, has a grid of small pits, or has large pits; one is seen from six sides. All surfaces are known in
-closed form (`radius_mm`).
+The objects are a pipe of 300 mm diameter and 0.5 % ovality, and welds. The pipe is smooth, has a grid of small pits, or
+has large pits; one is seen from six sides. All surfaces are known in closed form (`radius_mm`).
 """
 
 from dataclasses import dataclass
@@ -12,7 +11,6 @@ from typing import Any
 import numpy as np
 import tomli_w
 import trimesh
-from thin_wall import write_plate
 
 import twin
 import uwlts
@@ -157,8 +155,7 @@ def record(folder: Path, draw: int) -> None:
     ]
     campaign = {"base": "thesis", "title": "inspection, calibration", "recordings": calibration}
     (folder / "calibration.toml").write_text(tomli_w.dumps(campaign), encoding="utf-8")
-    write_plate(folder)
-    for name in ("calibration", *WATERS, "plate"):
+    for name in ("calibration", *WATERS):
         twin.record(folder / f"{name}.toml", out=folder / name, seed=draw)
     if not (path := folder / "calibration" / "calibration.json").exists():
         views = {name: [folder / "calibration" / f"target-{name}.h5"] for name in ("bare", "air", "water")}

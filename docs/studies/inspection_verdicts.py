@@ -20,7 +20,7 @@ from tests.oracles import damaged_pipes, joined_pipes
 from tests.oracles.damaged_pipes import Part, Truth
 from uwlts.errors import EvaluationError
 from uwlts.inspection.features import Feature, FeatureKind, Inspection
-from uwlts.report.measured_values import FindingLimits, judge_feature
+from uwlts.inspection.findings_order import FindingLimits, judge_feature
 from uwlts.storage.cloud import PointCloud
 
 KINDS = damaged_pipes.KINDS | joined_pipes.KINDS

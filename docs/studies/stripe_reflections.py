@@ -237,19 +237,11 @@ class Rendered:
         """Return an object with the attributes of a capture that `find_stripes` needs."""
         count = len(self.images)
         about = {"header": SimpleNamespace(sensor=self.sensor, saturation_dn=255), "path": Path("rendered.h5")}
-        about |= {
-            "has_image": np.ones(count, bool),
-            "laser_on": np.ones(count, bool),
-            "stage_mm": np.arange(count),
-            "exposure_ms": np.ones(count),
-        }
+        about |= {"laser_on": np.ones(count, bool), "stage_mm": np.arange(count), "exposure_ms": np.ones(count)}
         return _Capture(images=self.images, pose=np.full((count, 4, 4), np.nan), **about)
 
 
 class _Capture(SimpleNamespace):
-    def read_observation(self, index: int) -> np.ndarray:
-        return self.images[index]
-
     def image(self, index: int) -> np.ndarray:
         return self.images[index]
 

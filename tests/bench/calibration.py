@@ -30,13 +30,10 @@ class _InMemory:
     def __init__(self, capture: Capture, times: int = 1):
         self.capture = capture
         self.path, self.header, self.pose = capture.path, capture.header, np.tile(capture.pose, (times, 1, 1))
-        self.laser_on, self.has_image = np.tile(capture.laser_on, times), np.tile(capture.has_image, times)
+        self.laser_on = np.tile(capture.laser_on, times)
         self.stage_mm, self.exposure_ms = np.tile(capture.stage_mm, times), np.tile(capture.exposure_ms, times)
         self.speed_mm_per_s, self.time_s = np.tile(capture.speed_mm_per_s, times), np.arange(times * len(capture)) * 1.0
         self._images = [capture.image(number) for number in range(len(capture))] * times
-
-    def read_observation(self, index: int) -> np.ndarray:
-        return self._images[index]
 
     def image(self, index: int) -> np.ndarray:
         return self._images[index]

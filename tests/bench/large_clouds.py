@@ -43,7 +43,6 @@ def main(points: int = 10_000_000, *, write: bool = False) -> int:
             ("uwlts inspect after.ply --wall-mm 9.5 --out after.json", 4.0),
             ("uwlts compare after.ply before.ply --out change.html", 8.0),
             ("uwlts register before.ply after.ply --out both.h5", 8.0),
-            ("uwlts mesh after.ply --out after-mesh.ply", 8.0),
         )
         missed, rows = 0, []
         for line, limit_gb in commands:

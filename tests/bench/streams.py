@@ -1,4 +1,4 @@
-"""Memory of the reconstruction of long rides: profiles of a 3D camera on a vehicle, with path, mount and covariance."""
+"""Memory of the reconstruction of long rides: images of a sensor on a vehicle, with path, mount and covariance."""
 
 import os
 import sys
@@ -10,22 +10,22 @@ from tempfile import TemporaryDirectory
 import h5py
 import numpy as np
 
+from tests.uwlts.drawn_stripes import draw_centres
 from tests.uwlts.mount_views import known_mount
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import CaptureHeader
-from uwlts.model.stripe import Coordinates
 from uwlts.model.trajectory import Trajectory
 from uwlts.recalibration.as_built import as_built
 from uwlts.storage.capture import Frame
 from uwlts.storage.capture_writer import CaptureWriter
 
 RATE_HZ, SPEED_MM_PER_S, NOISE_PX = 200.0, 100.0, 0.1
-"""Of the profiles, of the vehicle, and of the stripe centres."""
+"""Of the images, of the vehicle, and of the stripe centres."""
 RECONSTRUCT = (
     "uwlts reconstruct ride.h5 --calibration calibration.json --mount mount.json --trajectory path.csv "
     "--pose-format quaternion-xyzw --out ride.cloud.h5"
 )
-_DIFFERENT = 50  # profiles that are written one by one; further ones are copies
+_DIFFERENT = 50  # images that are written one by one; further ones are copies
 
 
 @dataclass(frozen=True)
@@ -65,22 +65,25 @@ def write_ride(folder: Path, frames: int) -> None:
     known_mount(np.eye(4), time_offset_s=0.0, time_offset_std_s=1e-4).save(folder / "mount.json")
     lines, length = camera.lines(), camera.height_px if camera.stripe_along == "width" else camera.width_px
     place = np.arange(lines)
-    with CaptureWriter(folder / "ride.h5", header, dtype=np.dtype(np.uint8), centre_lines=True) as writer:
+    with CaptureWriter(folder / "ride.h5", header, dtype=np.dtype(np.uint8)) as writer:
         for k in range(min(frames, _DIFFERENT)):
             # A wavy bottom, without every fortieth line.
             centre = length * (0.5 + 0.1 * np.sin(2 * np.pi * (place / 200 + k / _DIFFERENT)))
             centre = np.where(place % 40 == 0, np.nan, centre + NOISE_PX * rng.normal(size=lines))
-            rows = np.stack([centre, 100 + rng.normal(size=lines), np.full(lines, 4.0)])
-            profile = Coordinates().stripe(rows, stripe_along=camera.stripe_along, length_px=length)
-            writer.append(Frame(profile, 0.0, True, 1.0, k / RATE_HZ))
+            image = draw_centres(centre, length, stripe_along=camera.stripe_along)
+            writer.append(Frame(image, 0.0, True, 1.0, k / RATE_HZ))
     with h5py.File(folder / "ride.h5", "r+") as file:
         for name, dataset in file.items():
-            first = dataset[...]
+            first = None if name == "frames" else dataset[...]
             dataset.resize(frames, axis=0)
             if name == "time_s":
                 dataset[...] = np.arange(frames) / RATE_HZ
-            elif name != "frames":
+            elif first is not None:
                 dataset[...] = np.resize(first, dataset.shape)
+            else:
+                for k in range(_DIFFERENT, frames):
+                    mask, chunk = dataset.id.read_direct_chunk((k % _DIFFERENT, 0, 0))
+                    dataset.id.write_direct_chunk((k, 0, 0), chunk, mask)
     times = np.linspace(-1.0, frames / RATE_HZ + 1.0, max(20, frames // 10))
     poses = np.tile(np.eye(4), (len(times), 1, 1))
     poses[:, 0, 3] = SPEED_MM_PER_S * times

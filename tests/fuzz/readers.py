@@ -39,7 +39,7 @@ from uwlts.comparison.change_reference import read_datums, read_reference, read_
 from uwlts.desk.guided_plan import load_guided_plan
 from uwlts.evaluation.evaluate import read_evaluation
 from uwlts.hardware.scan_plan import load_plan
-from uwlts.model.artefacts import read_artefact
+from uwlts.model.artefacts import resolve_artefact
 from uwlts.model.library import library_folder, load_sensor
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.report.certificate import check_certificate, make_certificate
@@ -51,10 +51,8 @@ from uwlts.storage.data_set import Sample, ShardReader, load_dataset, open_shard
 from uwlts.storage.figure_table import FigureTable, MeasuredFigure, read_figures
 from uwlts.storage.image_file import read_image
 from uwlts.storage.import_.camera_files import read_intrinsics, set_intrinsics
-from uwlts.storage.import_.centre_lines import read_profiles as read_centre_lines
 from uwlts.storage.import_.folder_description import capture_header, described_sensor, read_description, read_header
 from uwlts.storage.import_.matching import read_rows
-from uwlts.storage.mesh_file import read_mesh
 from uwlts.storage.mount_files import read_mount, read_profiles
 from uwlts.storage.pose_files import read_trajectory
 from uwlts.storage.truth import read_truth, write_truth
@@ -316,8 +314,7 @@ def _surface(path: Path) -> None:
 
 
 def _read_surface(path: Path) -> None:
-    """Read a mesh as a result and as a reference of a comparison."""
-    read_mesh(path)
+    """Read a mesh as a reference of a comparison."""
     # Large discs have few samples, whose memory has its own limit.
     read_reference(path, unit="mm", disc_mm=1e9)
 
@@ -384,15 +381,6 @@ def _read_card(path: Path) -> None:
         load_dataset(folder)
 
 
-def _lines(path: Path) -> None:
-    """Write centre lines of two profiles as an array or a table."""
-    numbers = np.arange(12.0).reshape(2, 6)
-    if path.suffix == ".npy":
-        np.save(path, numbers)
-    else:
-        np.savetxt(path, numbers, delimiter=",")
-
-
 READERS = {
     each.name: each
     for each in (
@@ -424,7 +412,7 @@ READERS = {
         Reader("campaign", ".toml", "toml", _shipped("campaigns/demo.toml"), load_campaign),
         Reader("study", ".toml", "toml", _shipped("studies/baseline-angle.toml"), load_study),
         Reader("plan", ".toml", "toml", _plan, lambda path: load_plan(path).header("a")),
-        Reader("artefact", ".toml", "toml", _artefact, read_artefact),
+        Reader("artefact", ".toml", "toml", _artefact, resolve_artefact),
         Reader("import", ".toml", "toml", _import_description, _read_import),
         Reader("table", ".csv", "lines", _table, read_rows),
         Reader("mount", ".json", "json", _mount, read_mount),
@@ -457,8 +445,6 @@ READERS = {
         Reader("shard-tar", ".tar", "bytes", _shard, _read_shard),
         Reader("card", ".json", "json", _card, _read_card),
         Reader("data-set", ".toml", "toml", _shipped("datasets/stripe-turbid.toml"), load_data_set),
-        Reader("centre-lines-npy", ".npy", "bytes", _lines, lambda path: read_centre_lines(path, 6)),
-        Reader("centre-lines-csv", ".csv", "lines", _lines, lambda path: read_centre_lines(path, 6)),
         Reader(
             "shape",
             ".toml",

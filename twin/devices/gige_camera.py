@@ -7,13 +7,13 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from ctypes import c_char_p, c_double, c_int, c_size_t, c_uint32, c_uint64, c_void_p
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType, SimpleNamespace
-from typing import TYPE_CHECKING, Literal, Self
+from types import SimpleNamespace
+from typing import Literal, Self
 from xml.etree import ElementTree
 
 import numpy as np
@@ -21,59 +21,40 @@ import numpy as np
 from uwlts.errors import HardwareError, ImageError
 from uwlts.runtime.optional_library import load_aravis
 
-if TYPE_CHECKING:
-    from twin.sensor.detector import PeakFinder
-
 # Data rate of 1 Gbit/s.
 _BYTES_PER_S = 125e6
 # Packets per burst, because sleeps are not exact.
 _TOGETHER = 8
 # Headers of IP, UDP and GVSP, which the packet size includes.
 _OVERHEAD_BYTES = 36
-# Kinds of packets and payload, and pixel formats (GigE Vision 2.0; GenICam Pixel Format Naming Convention).
+# Kinds of packets and payload, and the pixel format (GigE Vision 2.0; GenICam Pixel Format Naming Convention).
 _LEADER = 1
 _TRAILER = 2
 _PAYLOAD = 3
 _IMAGE = 1
 _WITH_CHUNKS = 0x4000
 _MONO8 = 0x01080001
-_COORD3D_C16 = 0x011000B8
 # Chunk identifiers, defined by the camera.
 _IMAGE_CHUNK = 0x45430000
-ENCODER_CHUNK = 0x45430001
-TIME_CHUNK = 0x45430002
+_ENCODER_CHUNK = 0x45430001
 _CHUNK_BYTES = 3 * 8
-"""Size of the chunks' identifiers and lengths after an image."""
-_ROW_BYTES = 2 * 8  # size of the chunks' data for each row
+"""Size of the encoder count, and of the identifiers and lengths of image and count, after an image."""
 
 
 def image_packets(
-    image: np.ndarray,
-    time_ns: int,
-    *,
-    number: int,
-    region: tuple[int, int, int, int],
-    packet_bytes: int,
-    chunks: Mapping[int, Sequence[int]] = MappingProxyType({}),
+    image: np.ndarray, time_ns: int, *, number: int, packet_bytes: int, count: int | None = None
 ) -> list[bytes]:
-    """Return the packets of an image (H, W), uint8 or uint16: leader, payload of a region, and trailer.
+    """Return the packets of an image (H, W), uint8: leader, payload, and trailer.
 
-    ``number`` is that of the frame, 16 bits. ``region`` is left, top, width and height in px; pixels outside the image
-    are dark. ``packet_bytes`` is the size of a packet including all headers. ``chunks`` has one number per row for each
-    chunk identifier, sent after the image (GigE Vision 2.0, extended chunk mode).
+    ``number`` is that of the frame, 16 bits. ``packet_bytes`` is the size of a packet including all headers. ``count``
+    is that of the encoder, sent after the image (GigE Vision 2.0, extended chunk mode).
     """
-    x, y, width, height = region
-    seen = np.zeros((height, width), image.dtype)
-    part = image[y : y + height, x : x + width]
-    seen[: part.shape[0], : part.shape[1]] = part
-    pixels, room = seen.astype(seen.dtype.newbyteorder("<")).tobytes(), packet_bytes - _OVERHEAD_BYTES
-    kind, pixel_format = _IMAGE, _MONO8 if image.dtype == np.uint8 else _COORD3D_C16
-    if chunks:
+    height, width = image.shape
+    pixels, room, kind = image.tobytes(), packet_bytes - _OVERHEAD_BYTES, _IMAGE
+    if count is not None:
         kind |= _WITH_CHUNKS
-        pixels += struct.pack(">II", _IMAGE_CHUNK, len(pixels))
-        for chunk, numbers in chunks.items():
-            pixels += struct.pack(f">{len(numbers)}qII", *numbers, chunk, 8 * len(numbers))
-    leader = struct.pack(">HHQIIIIIHH", 0, kind, time_ns, pixel_format, width, height, x, y, 0, 0)
+        pixels += struct.pack(">IIqII", _IMAGE_CHUNK, len(pixels), count, _ENCODER_CHUNK, 8)
+    leader = struct.pack(">HHQIIIIIHH", 0, kind, time_ns, _MONO8, width, height, 0, 0, 0, 0)
     parts = [pixels[start : start + room] for start in range(0, len(pixels), room)]
     bodies = [(_LEADER, leader), *((_PAYLOAD, each) for each in parts), (_TRAILER, struct.pack(">II", kind, height))]
     return [struct.pack(">HHI", 0, number, kind << 24 | index) + body for index, (kind, body) in enumerate(bodies)]
@@ -117,13 +98,9 @@ class _Register:
 
     MAKER, MODEL, STREAM_PORT, PACKET_SIZE, STREAM_IP = 0x48, 0x68, 0xD00, 0xD04, 0xD18
     WIDTH, HEIGHT, SENSOR_HEIGHT, SENSOR_WIDTH = 0x100, 0x104, 0x118, 0x11C
-    ACQUISITION, OFFSET_X, OFFSET_Y = 0x124, 0x130, 0x134
-    TRIGGER_SOFTWARE, DEVICE_ID, PIXEL_FORMAT = 0x30C, 0xD8, 0x128
-    SCAN3D_SCALE, SCAN3D_OFFSET, SCAN3D_INVALID = 0x1000, 0x1008, 0x1010
-    CHUNKS, ENCODER_CHUNK, TIME_CHUNK = 0x1020, 0x1024, 0x1028
+    ACQUISITION, TRIGGER_SOFTWARE, DEVICE_ID = 0x124, 0x30C, 0xD8
+    CHUNKS, ENCODER_CHUNK = 0x1020, 0x1024
 
-
-_REGION = (_Register.OFFSET_X, _Register.OFFSET_Y, _Register.WIDTH, _Register.HEIGHT)
 
 _FUNCTIONS = {
     "arv_gv_fake_camera_new_full": (c_void_p, [c_char_p, c_char_p, c_char_p]),
@@ -146,16 +123,11 @@ _FUNCTIONS = {
 
 @dataclass(frozen=True)
 class _Shot:
-    """Image, or profiles (N, L), with the start time of each exposure in ns and the encoder counts."""
+    """Image (H, W), the start of its exposure in ns, and the encoder count if there is an encoder."""
 
-    seen: np.ndarray
-    times_ns: tuple[int, ...]
-    counts: tuple[int, ...]
-
-    def __add__(self, later: "_Shot") -> "_Shot":
-        """Return these profiles followed by later ones."""
-        seen = np.concatenate([self.seen, later.seen])
-        return _Shot(seen, self.times_ns + later.times_ns, self.counts + later.counts)
+    image: np.ndarray
+    time_ns: int
+    count: int | None
 
 
 @dataclass(frozen=True)
@@ -177,10 +149,9 @@ class GigeCamera:
     raises an exception, the frame is lost and the exception is kept in ``failure``. A trigger that arrives during the
     making of an image replaces the previous trigger, which is not answered.
 
-    With ``scan3d`` it is a 3D camera: its pixel format is Coord3D_C16 until a program selects Mono8. Each frame
-    contains the profile of an image, with 0 for no stripe. A free-running camera sends ``Height`` profiles together.
-    ``encoder`` returns the count of an encoder that is wired to the camera. Count and time of each profile are sent as
-    chunk data on request.
+    Frames contain the whole image, also if a program sets a region.
+
+    ``encoder`` returns the count of an encoder that is wired to the camera. It is sent as chunk data on request.
 
     ``expose`` is called in the middle of each exposure of a free-running camera, at its frame rate and with true time
     stamps. Images are made later and wait in the camera's memory. They are lost at the end of the acquisition.
@@ -194,12 +165,11 @@ class GigeCamera:
         *,
         width_px: int = 1280,
         height_px: int = 1024,
-        scan3d: "PeakFinder | None" = None,
         encoder: Callable[[], int] | None = None,
         expose: Callable[[], ExposedFrame] | None = None,
     ):
         self.failure: BaseException | None = None
-        self._frame, self._scan3d, self._encoder, self._expose = frame, scan3d, encoder, expose
+        self._frame, self._encoder, self._expose = frame, encoder, expose
         self._size = (height_px, width_px)
         self._library = _load_functions()
         # The library does not keep a reference to the callback.
@@ -212,7 +182,6 @@ class GigeCamera:
         self._making: Future[_Shot] | None = None
         self._answer: _Shot | None = None
         self._last: _Shot | None = None
-        self._gathered: tuple[int, _Shot | None] = 0, None
         self._maker_thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="gige-camera")
         self._stopping = threading.Event()
 
@@ -268,7 +237,7 @@ class GigeCamera:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as guard:
             guard.bind(("255.255.255.255", PORT))
             with tempfile.NamedTemporaryFile(suffix=".xml") as features:
-                features.write(self._features())
+                features.write(self._describe_features())
                 features.flush()
                 interface, name = LOOPBACK.encode(), features.name.encode()
                 self._server = library.arv_gv_fake_camera_new_full(interface, _SERIAL, name)
@@ -296,10 +265,6 @@ class GigeCamera:
             _Register.HEIGHT: height,
             _Register.PACKET_SIZE: _PACKET_BYTES,
         }
-        if self._scan3d is not None:
-            numbers[_Register.PIXEL_FORMAT] = _COORD3D_C16
-            memory[_Register.SCAN3D_SCALE] = struct.pack(">d", self._scan3d.scale_px())
-            memory |= dict.fromkeys((_Register.SCAN3D_OFFSET, _Register.SCAN3D_INVALID), struct.pack(">d", 0.0))
         for register, data in memory.items():
             library.arv_fake_camera_write_memory(self._camera, register, len(data), data)
         for register, number in numbers.items():
@@ -307,8 +272,8 @@ class GigeCamera:
         library.arv_fake_camera_set_trigger_frequency(self._camera, _LOOKS_FOR_TRIGGER_HZ)
         library.arv_fake_camera_set_fill_pattern(self._camera, self._callback, None)
 
-    def _features(self) -> bytes:
-        """Return the XML of the camera's features: Aravis's fake camera, with those of a 3D camera or encoder."""
+    def _describe_features(self) -> bytes:
+        """Return the XML of the camera's features: Aravis's fake camera, with those of an encoder if it has one."""
         library, size = self._library, c_size_t()
         usual = library.arv_fake_camera_new(_SERIAL)
         described = ctypes.string_at(library.arv_fake_camera_get_genicam_xml(usual, ctypes.byref(size)), size.value)
@@ -316,22 +281,11 @@ class GigeCamera:
         # The standard's name of the exposure (GenICam SFNC 2.7).
         root = ElementTree.fromstring(described.replace(b"ExposureTimeAbs", b"ExposureTime"))
         root.attrib |= {"VendorName": "UWLTS", "ModelName": "Twin", "ToolTip": "digital twin of a camera"}
-        more = ElementTree.fromstring((Path(__file__).parent / "scan3d_features.xml").read_bytes())
-        scan3d = {} if self._scan3d is None else {"Coord3D_C16": _COORD3D_C16}
-        for feature in more:
-            name = feature.get("Name", "")
-            if (name.startswith("Scan3d") and scan3d) or (not name.startswith("Scan3d") and self._encoder is not None):
-                root.append(feature)
-        formats = root.find(f"{{{_GENAPI}}}Enumeration[@Name='PixelFormat']")
-        payload = root.find(f"{{{_GENAPI}}}IntSwissKnife[@Name='PayloadSize']/{{{_GENAPI}}}Formula")
-        assert formats is not None and payload is not None and payload.text is not None
-        for name, number in scan3d.items():
-            entry = ElementTree.Element(f"{{{_GENAPI}}}EnumEntry", Name=name)
-            ElementTree.SubElement(entry, f"{{{_GENAPI}}}Value").text = str(number)
-            # The standard's schema requires entries of one kind to be adjacent.
-            formats.insert([each.tag for each in formats].index(entry.tag), entry)
         if self._encoder is not None:
-            payload.text += f" + {_CHUNK_BYTES} + HEIGHT * {_ROW_BYTES}"
+            root.extend(ElementTree.fromstring((Path(__file__).parent / "encoder_features.xml").read_bytes()))
+            payload = root.find(f"{{{_GENAPI}}}IntSwissKnife[@Name='PayloadSize']/{{{_GENAPI}}}Formula")
+            assert payload is not None and payload.text is not None
+            payload.text += f" + {_CHUNK_BYTES}"
         ElementTree.register_namespace("", _GENAPI)
         return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
 
@@ -351,21 +305,11 @@ class GigeCamera:
             if self._server is None or not self._read_register(_Register.ACQUISITION):
                 return
         try:
-            seen = self._convert_image(exposed.image(exposure_ms))
+            image = exposed.image(exposure_ms)
         except BaseException as error:
             self.failure = error
             raise
-        counts = () if exposed.encoder is None else (exposed.encoder,)
-        shot = _Shot(seen, (round(1e9 * exposed.middle_s - 0.5e6 * exposure_ms),), counts)
-        if self._sends_profiles():
-            # Profiles are collected until a frame is full; another port indicates another acquisition.
-            port, (gathered_for, gathered) = self._read_register(_Register.STREAM_PORT), self._gathered
-            shot = shot if gathered is None or gathered_for != port else gathered + shot
-            short = len(shot.seen) < self._read_register(_Register.HEIGHT)
-            self._gathered = port, shot if short else None
-            if short:
-                return
-        self._send(shot)
+        self._send(_Shot(image, round(1e9 * exposed.middle_s - 0.5e6 * exposure_ms), exposed.encoder))
 
     def _send(self, shot: _Shot) -> None:
         with self._lock:
@@ -378,19 +322,10 @@ class GigeCamera:
             dropped, shortened = self._apply_fault("drop"), self._apply_fault("cut")
             names = (_Register.STREAM_IP, _Register.STREAM_PORT, _Register.PACKET_SIZE)
             host, port, packet_bytes = map(self._read_register, names)
-            x, y, width, height = map(self._read_register, _REGION)
-            region = x, y, width, height
-            chunks: dict[int, tuple[int, ...]] = {}
-            if shot.counts and self._read_register(_Register.CHUNKS):
-                if self._read_register(_Register.ENCODER_CHUNK):
-                    chunks[ENCODER_CHUNK] = shot.counts
-                if self._read_register(_Register.TIME_CHUNK):
-                    chunks[TIME_CHUNK] = shot.times_ns
+            counted = self._read_register(_Register.CHUNKS) and self._read_register(_Register.ENCODER_CHUNK)
         if not dropped:
-            size = packet_bytes & 0xFFFF
-            packets = image_packets(
-                shot.seen, shot.times_ns[0], number=self._number, region=region, packet_bytes=size, chunks=chunks
-            )
+            size, count = packet_bytes & 0xFFFF, shot.count if counted else None
+            packets = image_packets(shot.image, shot.time_ns, number=self._number, packet_bytes=size, count=count)
             if shortened:
                 lost = range(_CUT_EVERY - 1, len(packets), _CUT_EVERY) or (len(packets) - 2,)
                 packets = [packet for index, packet in enumerate(packets) if index not in lost]
@@ -440,15 +375,7 @@ class GigeCamera:
         image = self._frame(exposure_ms)
         if image.shape != self._size or image.dtype != np.uint8:
             raise ImageError(f"the image is {image.shape} {image.dtype}; expected {self._size} uint8")
-        counts = () if self._encoder is None else (self._encoder(),)
-        return _Shot(self._convert_image(image), (began_ns,), counts)
-
-    def _convert_image(self, image: np.ndarray) -> np.ndarray:
-        """Return the image, or a 3D camera's profile (1, L) of it."""
-        return self._scan3d.numbers(image)[None] if self._scan3d is not None and self._sends_profiles() else image
-
-    def _sends_profiles(self) -> bool:
-        return self._scan3d is not None and self._read_register(_Register.PIXEL_FORMAT) == _COORD3D_C16
+        return _Shot(image, began_ns, None if self._encoder is None else self._encoder())
 
     def _read_register(self, register: int) -> int:
         number = c_uint32()

@@ -158,18 +158,13 @@ class Bench:
 
     ``state()`` returns the present true state of the stage, and ``track`` is the position of the scene's motion on it.
     With ``lamp``, the lamp is on while the laser is off. ``frames`` are counted, and ``renderings`` of their light; at
-    rest it is kept. Raises DesignError if the detector does not have 8 bits, or the profile lines of a 3D camera are
-    not its columns.
+    rest it is kept. Raises DesignError if the detector does not have 8 bits.
     """
 
     def __init__(self, simulator: "SensorSimulator", *, state: Callable[[], StageState], track: Track, lamp: bool):
         bits = simulator.sensor.detector.bits
         if bits != 8:
             raise DesignError(f"the served camera has 8 bits, the sensor's detector {bits}: set bits = 8")
-        if simulator.peak_finder is not None and simulator.sensor.camera.stripe_along != "width":
-            raise DesignError(
-                "the profile lines of a 3D camera are its columns: use a sensor with stripe_along = 'width'"
-            )
         self.frames = self.renderings = 0
         self._simulator, self._state, self._track, self._lamp = simulator, state, track, lamp
         self._travelled_mm = math.nan
@@ -299,7 +294,7 @@ def serve(
         Named position of the objects, such as near, standoff or far.
     effects
         Effects of real images to add, as for `simulate`, except lamp-and-laser, because the controller switches the
-        laser. With camera-3d, the camera's pixel format is Coord3D_C16 until a program sets Mono8.
+        laser.
     without
         Effects to omit, as for `simulate`. Motion blur affects a free-running camera, not a triggered one. Without
         multiple-scattering and secondary-light, a frame takes half of the time, but its light is less accurate: no halo
@@ -382,12 +377,7 @@ def serve(
         return ExposedFrame(state.time_s, controller.steps(state), image)
 
     camera = GigeCamera(
-        frame,
-        width_px=built.camera.width_px,
-        height_px=built.camera.height_px,
-        scan3d=simulator.peak_finder,
-        encoder=controller.steps,
-        expose=expose,
+        frame, width_px=built.camera.width_px, height_px=built.camera.height_px, encoder=controller.steps, expose=expose
     )
     inject(1, ahead=True)
     bench.prepare(simulator.exposure_ms["laser"])

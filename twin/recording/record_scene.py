@@ -79,8 +79,8 @@ def record_scene(
     # The true values must not be known to the evaluation, so the finished capture does not contain the plan.
     built = simulator.sensor
     plan: Table = {"scene": scene.model_dump(mode="json"), "as_built": built.model_dump(mode="json"), **drawn}
-    kinds = {"centre_lines": simulator.peak_finder is not None, "moving": motion.stage_speed_mm_s() != 0}
-    kinds["covariances"] = isinstance(motion, Platform) and motion.states_covariance
+    covariances = isinstance(motion, Platform) and motion.states_covariance
+    kinds = {"moving": motion.stage_speed_mm_s() != 0, "covariances": covariances}
     with (
         CaptureWriter(path, header, dtype=dtype, **kinds, plan=plan, overwrite=overwrite, resume=resume) as writer,
         ThreadPoolExecutor(1) as camera,

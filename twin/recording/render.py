@@ -6,7 +6,7 @@ Mitsuba is imported when the first scene is rendered, after its variant and libL
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -82,7 +82,7 @@ def render(
     frames
         Numbers of the scan's images to render, from 0; default: all.
     effects
-        As for `simulate`; with camera-3d, the images are returned, not centre lines.
+        As for `simulate`.
     scene, sensor, as_built, placement, medium, spp, seed, water, without, ideal, variant
         As for `simulate`; scene and sensors may also be descriptions, and there is one placement.
 
@@ -99,8 +99,6 @@ def render(
     described = choose_scene(scene, placement=placement, medium=medium, water=water)
     _, built = choose_sensors(sensor, as_built)
     options = Options.from_names(spp=spp, seed=seed, effects=effects, without=without, ideal=ideal)
-    # Return images even if a 3D camera would reduce them to centre lines.
-    options = replace(options, flaws=replace(options.flaws, camera_3d=0))
     shots = list(enumerate(described.motion.shots()))
     if frames is not None:
         if not frames or not all(0 <= number < len(shots) for number in frames):
@@ -172,8 +170,7 @@ def simulate(
         Effects of real images to add, NAME of typical strength or NAME=STRENGTH: glare=0.02, ghost=0.003,
         vignetting=0.4, uneven-lamp=0.6, particles=1000 and bubbles=200 (per litre), caustics=2 (wind in m/s),
         stray-light=0.02, side-lobes=0.01, lamp-reflection=0.001, dirt=0.1, lamp-and-laser, pixel-aspect=1.002,
-        tangential=0.001, rolling-shutter=10 (us per row), row-noise=5 (electrons), jpeg=90, colour-filter,
-        camera-3d=16 (steps per px; laser images become centre lines).
+        tangential=0.001, rolling-shutter=10 (us per row), row-noise=5 (electrons), jpeg=90, colour-filter.
     without
         Effects to leave out: defocus, haze, multiple-scattering, secondary-light, gloss, motion, ambient, speckle,
         fixed-pattern, noise.

@@ -1,1 +1,1 @@
-"""From irradiance to grey values: speckle, detector, flaws of real images, and the peak finder of 3D cameras."""
+"""From irradiance to grey values: speckle, detector, and flaws of real images."""

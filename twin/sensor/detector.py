@@ -2,8 +2,7 @@
 
 Pixels of a camera differ from each other in the same way in every image (`fixed_pattern`). Charge above the full well
 of a pixel spills along its column (`spread_blooming`). Shot and read noise come from `twin.sensor.random_numbers`. The
-peak finder of a 3D camera reduces an image to one number per profile line. The rest are flaws of real recordings
-(`twin.rendering_options.Flaws`).
+rest are flaws of real recordings (`twin.rendering_options.Flaws`).
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from typing import cast
 
 import cv2
 import numpy as np
-from scipy.signal import fftconvolve
 
 from twin.rendering_options import Flaws
 from twin.sensor.random_numbers import add_normal_numbers, poisson_numbers
@@ -214,55 +212,6 @@ def _sweep(charge: np.ndarray, full_well_e: float, share: float) -> np.ndarray:
     return kept
 
 
-# --- 3D cameras -------------------------------------------------------------------------------------------------------
-
-
-INVALID = 0  # number of a line without a stripe
-THRESHOLD = 0.06  # fraction of the full scale above which pixels count: above the noise, as usual for such cameras
-_FEWEST_PX = 2  # smallest width of a stripe; narrower peaks are hot pixels
-_REACH_PX = 64  # largest distance of a stripe's edge from its brightest pixel
-
-
-@dataclass(frozen=True)
-class PeakFinder:
-    """Finder of peak positions across profile lines in steps of 1 / ``steps`` px.
-
-    It uses the brightest pixel of a line and the contiguous pixels above the threshold, weighted by their excess, as
-    the firmware of cameras does (Fisher and Naidu, "A comparison of algorithms for subpixel peak detection", 1996,
-    centre of mass). ``full_scale_dn`` is the largest grey value.
-    """
-
-    camera: Camera
-    full_scale_dn: int
-    steps: int
-
-    def scale_px(self) -> float:
-        """Return the size of one step in pixels."""
-        return 1 / self.steps
-
-    def numbers(self, image: np.ndarray) -> np.ndarray:
-        """Return positions (L,), uint16, in steps on the profile lines of an image (H, W).
-
-        Lines without a stripe get `INVALID`.
-        """
-        across = image if self.camera.stripe_along == "width" else image.T
-        lines, brightest = np.arange(across.shape[1]), across.argmax(axis=0)
-        place = brightest + np.arange(-_REACH_PX, _REACH_PX + 1)[:, None]
-        inside = (place >= 0) & (place < len(across))
-        seen = across[np.clip(place, 0, len(across) - 1), lines].astype(np.float32)
-        above = np.where(inside, np.maximum(seen - np.float32(THRESHOLD * self.full_scale_dn), 0), 0)
-        # Pixels from the brightest one to the first dark one on either side.
-        run = np.minimum.accumulate(above[_REACH_PX:] > 0, axis=0)
-        before = np.minimum.accumulate(above[_REACH_PX::-1] > 0, axis=0)[::-1]
-        together = np.concatenate([before[:-1], run])
-        weight = np.where(together, above, 0)
-        total = weight.sum(axis=0)
-        whole = ~together[0] & ~together[-1] & ~(together & ((place == 0) | (place == len(across) - 1))).any(axis=0)
-        found = whole & (together.sum(axis=0) >= _FEWEST_PX)
-        centre = (place * weight).sum(axis=0) / np.where(found, total, 1)
-        return np.where(found, np.rint(centre * self.steps), INVALID).astype(np.uint16)
-
-
 GLARE_REACH = 0.15
 """Decay length of glare (1 / e) as a fraction of the image width (assumed from its visual appearance)."""
 GHOST_BLUR = 0.01  # standard deviation of a ghost's blur as a fraction of the image width (assumed)
@@ -330,9 +279,8 @@ def dirt(camera: Camera, share: float, *, seed: int) -> np.ndarray:
     """
     inner = camera.window.distance_mm
     px_per_mm = camera.focal_length_px() / inner
-    focus = camera.focus_distance_mm
-    working = camera.f_number * (1 + camera.focal_length_mm / (focus - camera.focal_length_mm))
-    blur_px = 0.5 * camera.focal_length_mm / working * (1 - inner / focus) * px_per_mm
+    pupil_mm = 0.5 * camera.focal_length_mm / camera.working_f_number()
+    blur_px = pupil_mm * (1 - inner / camera.focus_distance_mm) * px_per_mm
     largest_px = 0.5 * _SPOT_MM[1] * px_per_mm
     margin = math.ceil(blur_px + largest_px)
     # The radius of the smallest spot spans at least `_CELLS_PER_SPOT` cells.
@@ -358,7 +306,7 @@ def dirt(camera: Camera, share: float, *, seed: int) -> np.ndarray:
     free = cv2.resize(free, (width, height), interpolation=cv2.INTER_AREA)
     reach = np.arange(-math.ceil(blur_px), math.ceil(blur_px) + 1)
     disc = (np.hypot(reach[:, None], reach) <= max(blur_px, 0.5)).astype(np.float32)
-    free = fftconvolve(free, disc / disc.sum(), mode="same").astype(np.float32)
+    free = _convolve(free, disc / disc.sum())
     return np.clip(free[margin : margin + camera.height_px, margin : margin + camera.width_px], 0, 1)
 
 
@@ -376,9 +324,17 @@ def add_glare(light: np.ndarray, share: float) -> np.ndarray:
     y, x = np.ogrid[1 - rows : rows, 1 - columns : columns]
     cell_per_reach = cell / (GLARE_REACH * width)
     kernel = np.exp(-np.hypot(x, y) * cell_per_reach) * cell_per_reach**2 / (2 * math.pi)
-    veil = np.maximum(fftconvolve(coarse, kernel, mode="same"), 0).astype(np.float32)
+    veil = np.maximum(_convolve(coarse, kernel), 0)
     veil = cv2.resize(veil, padded.shape[::-1], interpolation=cv2.INTER_LINEAR)[:height, :width]
     return np.float32(1 - share) * light + np.float32(share) * veil
+
+
+def _convolve(light: np.ndarray, kernel: np.ndarray) -> np.ndarray:
+    """Return light (H, W), float32, convolved with a kernel and dark beyond its border."""
+    # Takes a second to import, which images without this light do not need.
+    from scipy.signal import fftconvolve
+
+    return fftconvolve(light, kernel, mode="same").astype(np.float32)
 
 
 def add_ghost(light: np.ndarray, camera: Camera, share: float) -> np.ndarray:

@@ -18,7 +18,7 @@ from uwlts.model.sensor import CaptureHeader, Sensor
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.runtime.workers import map_in_threads
 from uwlts.storage.capture import Capture
-from uwlts.stripe import Stripe, StripeOptions, StripeSettings, explain_missing_stripe, find_stripe
+from uwlts.stripe import StripeOptions, StripeSettings, explain_missing_stripe, extract_stripe
 from uwlts.stripe.capture_stripes import FEWEST_LINES, find_stripe_direction
 from uwlts.targets import Target, TargetView, parse_target
 
@@ -120,7 +120,7 @@ def find_air_evidence(
             done = _report(progress, "target", done, total)
         positions = np.array([image.stage_mm for image in images[first:]])
         on_target = partial(_find_target_stripe, capture, stripe, first, views[first:], positions, targets[0])
-        for (frame, _), found in map_in_threads(on_target, _read_laser_frames(capture)):
+        for (frame, _), found in map_in_threads(on_target, capture.frames(laser_on=True)):
             if isinstance(found, str):
                 warnings.append(f"{capture.path.name}, frame {frame}: stripe left out, {found}")
             else:
@@ -137,7 +137,7 @@ def find_air_evidence(
             )
     if not images:
         why = _explain_missing_target(captures, targets[0], reasons)
-        raise CalibrationError(f"the target was found in no image of {_names(captures)}: {why}")
+        raise CalibrationError(f"the target was found in no image of {_list_names(captures)}: {why}")
     names = [capture.path.name for capture in captures]
     no_stripe = "" if any(map(len, stripes)) else explain_captures_without_stripe(captures)
     return AirEvidence(targets[0], images, frames, stripes, warnings, no_stripe, outliers, names)
@@ -216,7 +216,7 @@ def step_evidence(
         if index is None:
             index = capture.header.medium.refractive_index(wavelength)
             index_std = capture.header.medium.index_uncertainty(wavelength, known)
-        for (frame, _), pixels in map_in_threads(partial(_find_stripe, capture, stripe), _read_laser_frames(capture)):
+        for (frame, _), pixels in map_in_threads(partial(_find_stripe, capture, stripe), capture.frames(laser_on=True)):
             if isinstance(pixels, str):
                 warnings.append(f"{capture.path.name}, frame {frame}: stripe left out, {pixels}")
             else:
@@ -231,11 +231,9 @@ def explain_captures_without_stripe(captures: Sequence[Capture]) -> str:
     """Return the reason why no stripe was found in captures; for captures of a target, none on the target."""
     header, count = captures[0].header, sum(int(np.count_nonzero(capture.laser_on)) for capture in captures)
     if not count:
-        return f"{_names(captures)}: no image with the laser on; take one at every position"
-    along, where = header.sensor.camera.stripe_along, f"laser images of {_names(captures)}"
+        return f"{_list_names(captures)}: no image with the laser on; take one at every position"
+    along, where = header.sensor.camera.stripe_along, f"laser images of {_list_names(captures)}"
     lit = [image for capture in captures for image in _choose_laser_images(capture, _LOOKED_AT)]
-    if not lit:
-        return f"no stripe in any of the {count} centre lines of {_names(captures)}: is the laser on?"
     full_dn = header.saturation_dn
     if any(find_stripe_direction(image, stripe_along=along, saturation=full_dn) == "along" for image in lit):
         return f"the {where} with a stripe were taken at other stage positions than the images with the target"
@@ -243,7 +241,7 @@ def explain_captures_without_stripe(captures: Sequence[Capture]) -> str:
     return f"no stripe in any of the {count} {where}: {reason}"
 
 
-def _names(captures: Sequence[Capture]) -> str:
+def _list_names(captures: Sequence[Capture]) -> str:
     return ", ".join(capture.path.name for capture in captures)
 
 
@@ -265,18 +263,10 @@ def _explain_missing_target(captures: Sequence[Capture], target: Target, reasons
 
 
 def _choose_laser_images(capture: Capture, most: int) -> Iterator[np.ndarray]:
-    """Yield at most ``most`` images with the laser on, evenly chosen; images of 3D cameras are skipped."""
-    lit = np.flatnonzero(capture.laser_on & capture.has_image)
+    """Yield at most ``most`` images with the laser on, evenly chosen."""
+    lit = np.flatnonzero(capture.laser_on)
     for place in np.unique(np.linspace(0, len(lit) - 1, most).astype(int)) if len(lit) else ():
         yield capture.image(int(lit[place]))
-
-
-_Seen = tuple[int, np.ndarray | Stripe]  # number of a laser frame, and its image or the stripe from a 3D camera
-
-
-def _read_laser_frames(capture: Capture) -> Iterator[_Seen]:
-    for frame in np.flatnonzero(capture.laser_on).tolist():
-        yield frame, capture.read_observation(frame)
 
 
 def detect_target(
@@ -298,27 +288,27 @@ def _find_target_stripe(
     views: Sequence[TargetView],
     positions_mm: np.ndarray,
     target: Target,
-    numbered: _Seen,
+    numbered: tuple[int, np.ndarray],
 ) -> tuple[int, TargetStripe] | str:
     """Find the stripe on the target, and the number of the target's image at this position, or return the reason."""
-    frame, seen = numbered
+    frame, image = numbered
     here = np.flatnonzero(np.abs(positions_mm - capture.stage_mm[frame]) <= SAME_POSITION_MM)
     if not len(here):
         return f"no target was found at {capture.stage_mm[frame]:g} mm"
     place = int(here[0])
     along, options, clip = _read_stripe_settings(capture, settings)
     try:
-        found = stripe_on_target(seen, views[place], target, stripe_along=along, options=options, saturation=clip)
+        found = stripe_on_target(image, views[place], target, stripe_along=along, options=options, saturation=clip)
     except ImageError as error:
         return str(error)
     return _explain_short_stripe(found.pixels) or (first + place, found)
 
 
-def _find_stripe(capture: Capture, settings: StripeSettings, numbered: _Seen) -> np.ndarray | str:
+def _find_stripe(capture: Capture, settings: StripeSettings, numbered: tuple[int, np.ndarray]) -> np.ndarray | str:
     """Find the stripe (N, 2) of a laser frame, or return the reason for rejection."""
     along, options, clip = _read_stripe_settings(capture, settings)
     try:
-        pixels = find_stripe(numbered[1], stripe_along=along, options=options, saturation=clip).pixels()
+        pixels = extract_stripe(numbered[1], stripe_along=along, options=options, saturation=clip).pixels()
     except ImageError as error:
         return str(error)
     return _explain_short_stripe(pixels) or pixels

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.stats import t
+from scipy import special
 
 from uwlts.fitting.least_squares import DEFAULT_K, MAD_TO_STD
-from uwlts.stripe import Stripe, StripeOptions, StripeStatus, extract_stripe, find_stripe
+from uwlts.stripe import Stripe, StripeOptions, StripeStatus, extract_stripe
 from uwlts.targets import Target, TargetView
 
 _DEGREE = 4  # degree for the bends of lens, window, line optics and plate; a higher one would follow outliers
@@ -28,7 +28,7 @@ class TargetStripe:
 
 
 def stripe_on_target(
-    seen: np.ndarray | Stripe,
+    image: np.ndarray,
     view: TargetView,
     target: Target,
     *,
@@ -39,18 +39,17 @@ def stripe_on_target(
     """Find the stripe on a flat target that was detected at the same position.
 
     The stripe is the smooth curve with most points. Lines with another structure are searched a second time near the
-    curve, if an image is given. Points off the curve (such as reflections) and outside the plate are rejected.
+    curve. Points off the curve (such as reflections) and outside the plate are rejected.
     Parameters and errors are those of `extract_stripe`.
     """
-    stripe = find_stripe(seen, stripe_along=stripe_along, saturation=saturation, options=options)
+    stripe = extract_stripe(image, stripe_along=stripe_along, saturation=saturation, options=options)
     to_plate, pixels = _find_homography(view), stripe.pixels()
     on_plate = _mask_plate(pixels, to_plate, target)
     lines = stripe.lines[on_plate]
     across = stripe.centre_px[lines]
     if len(lines) < _FEWEST:
         return TargetStripe(pixels[on_plate], 0)
-    # a 3D camera may not provide the width
-    width = float(np.nan_to_num(np.median(stripe.width_px[lines])))
+    width = float(np.median(stripe.width_px[lines]))
     curve = _Curve.fit_through(lines, across, tolerance_px=max(2.0, 0.25 * width))
     if curve is None:
         return TargetStripe(np.empty((0, 2)), len(lines))
@@ -60,9 +59,9 @@ def stripe_on_target(
     missing = np.setdiff1d(along_curve[expected], lines[near])
     outliers = int(np.count_nonzero(~near))
     lines, across = lines[near], across[near]
-    if isinstance(seen, np.ndarray) and len(missing) > _LOST * np.count_nonzero(expected):
+    if len(missing) > _LOST * np.count_nonzero(expected):
         width = float(np.median(stripe.width_px[lines]))
-        more_lines, more_across = _find_near_curve(seen, curve, missing, stripe_along, saturation, options, width)
+        more_lines, more_across = _find_near_curve(image, curve, missing, stripe_along, saturation, options, width)
         lines, across = np.concatenate([lines, more_lines]), np.concatenate([across, more_across])
         curve = curve.refine(lines, across)
         near = curve.holds(lines, across)
@@ -210,7 +209,7 @@ def find_step(places: np.ndarray, distances: np.ndarray) -> tuple[int, float] | 
     jumps = steps.T @ left / squares
     share = jumps**2 * squares / np.maximum(np.sum(left**2, axis=0), np.finfo(float).tiny)
     best = int(np.argmax(share.max(axis=1)))
-    least = t.isf(_FALSE_ALARM / (2 * share.size), count - 4) ** 2
+    least = special.stdtrit(count - 4, _FALSE_ALARM / (2 * share.size)) ** 2
     if share[best].max() < max(_LEAST_SHARE, least / (least + count - 4)):
         return None
     return int(moments[best]), float(abs(jumps[best, 0]) + abs(jumps[best, 1]) / 2)

@@ -128,23 +128,6 @@ def align(
         note_lean(aligned, found.cloud)
 
 
-@command_from(app, uwlts, "mesh", job="Reconstruct")
-def mesh(
-    call: Call,
-    *,
-    out: Annotated[
-        Path,
-        a_file(".ply", ".glb", ".stl"),
-        Parameter(help="Mesh to write: .ply (with the uncertainty of every vertex), .glb (glTF, m) or .stl."),
-    ],
-    overwrite: Overwrite = False,
-) -> None:
-    """Example: uwlts mesh left.cloud.h5 right.cloud.h5 --out pipe.glb"""
-    surface = call()
-    surface.save(out, overwrite=overwrite)
-    wrote(surface.lines(), [], out)
-
-
 @command_from(app, uwlts, "fit_radiometry", job="Scan")
 def radiometry(
     call: Call,
@@ -253,7 +236,7 @@ def inspect(
 
 
 @command_from(app, uwlts.report, "write_findings", job="Inspect", also=_INSPECTIONS)
-def findings_report(call: Call, *, section_mm=None, wall_mm=None, false_alarm=None, largest_ovality=None) -> None:
+def findings_report(call: Call, *, wall_mm=None, false_alarm=None, largest_ovality=None) -> None:
     """Example: uwlts findings-report pipe.cloud.h5 --wall-mm 9.5 --calibration water.json --out pipe.html --pdf"""
     from uwlts.pages.toolkit import json_beside
 

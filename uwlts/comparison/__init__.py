@@ -1,1 +1,1 @@
-"""Comparison of a surface with an earlier cloud, a mesh or an ideal shape; meshes with uncertainty."""
+"""Comparison of a surface with an earlier cloud, a mesh or an ideal shape."""

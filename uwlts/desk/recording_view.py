@@ -4,19 +4,16 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Self
 
 import numpy as np
 
-from uwlts.desk.server import DeskServer
 from uwlts.desk.shown_state import Board, FrameProfile, Picture
 from uwlts.errors import CaptureError
 from uwlts.model.calibration import AnyCalibration
-from uwlts.storage.calibration_file import resolve_calibration
-from uwlts.storage.capture import Capture, CaptureHeader, Frame, drawable_image, part_path
-from uwlts.stripe import find_stripe, warm_up
+from uwlts.storage.capture import Capture, CaptureHeader, Frame, part_path
+from uwlts.stripe import extract_stripe, warm_up
 
 LOOK_S = 0.1  # interval between checks for new images; a check takes a few ms
 _DAMAGED_S = 5.0
@@ -51,21 +48,19 @@ class RecordingView:
             board.show(Picture(frame.image, full_dn=full, caption=caption))
             return
         camera = self._header.sensor.camera
-        stripe = find_stripe(frame.seen, stripe_along=camera.stripe_along, saturation=full)
-        pixels, saturated, remarks = stripe.pixels(), None, []
+        stripe = extract_stripe(frame.image, stripe_along=camera.stripe_along, saturation=full)
+        pixels, remarks = stripe.pixels(), []
         self._found, self._lines = self._found + len(pixels), self._lines + len(stripe.status)
         caption += f"; stripe on {self._found:,} of {self._lines:,} profile lines so far"
-        if isinstance(frame.seen, np.ndarray):
-            brightest = frame.seen.max(axis=0 if camera.stripe_along == "width" else 1)
-            saturated = float((brightest >= full).mean())
-            if saturated > _MANY:
-                remarks.append("saturated on many lines: shorten the exposure")
-            elif np.quantile(brightest, 0.98) < _FAINT * full:
-                remarks.append("faint: lengthen the exposure, or is the laser off?")
+        brightest = frame.image.max(axis=0 if camera.stripe_along == "width" else 1)
+        saturated = float((brightest >= full).mean())
+        if saturated > _MANY:
+            remarks.append("saturated on many lines: shorten the exposure")
+        elif np.quantile(brightest, 0.98) < _FAINT * full:
+            remarks.append("faint: lengthen the exposure, or is the laser off?")
         if len(stripe.lines) < _FEW * len(stripe.status):
             remarks.append("almost no stripe: is the object in the volume?")
-        image = drawable_image(frame.seen, camera)
-        board.show(Picture(image, full_dn=full, caption=caption, stripe=pixels, saturated=saturated))
+        board.show(Picture(frame.image, full_dn=full, caption=caption, stripe=pixels, saturated=saturated))
         if self._calibration is not None and len(stripe.lines):
             profile = FrameProfile(frame, stripe, self._header, self._calibration)
             board.cloud.add(profile.points.points_mm, intensity=profile.points.intensity)
@@ -137,63 +132,3 @@ class BackgroundView:
         self._thread.join()
         if self._fault is not None and kind is None:
             raise self._fault
-
-
-def watch(
-    capture: str | Path,
-    *,
-    calibration: AnyCalibration | str | Path | None = None,
-    host: str = "127.0.0.1",
-    port: int = 8080,
-    report: Callable[[str], None] = print,
-) -> None:
-    """Show a recording in progress in a browser: the latest image with its stripe, and the cloud so far.
-
-    Ctrl-C ends it.
-
-    Parameters
-    ----------
-    capture : str or Path
-        Capture that is being recorded, or will be.
-    calibration : Calibration, PolynomialCalibration or path, optional
-        Calibration of the sensor, or polynomial calibration, for the cloud.
-    host : str
-        Address of the page; the default can be reached from this machine only.
-    port : int
-        Port of the page; if it is in use, the next free one is taken.
-    report : callable, optional
-        Called with lines of text, the first with the address of the page.
-
-    Raises
-    ------
-    CaptureError, CalibrationError
-        The finished capture is damaged; the calibration cannot be read, or does not fit the capture.
-    """
-    path, count = Path(capture), 0
-    known = None if calibration is None else resolve_calibration(calibration)
-    board = Board(path.name)
-    board.phase("waiting for the first image")
-    with DeskServer(board, host=host, port=port) as server:
-        try:
-            report(f"open {server.address}; Ctrl-C ends it")
-            if server.warning:
-                report(f"warning: {server.warning}")
-            view, begun = None, 0
-            for seen in follow_frames(path):
-                if seen is None:
-                    time.sleep(LOOK_S)
-                    continue
-                header, number, frame = seen
-                if view is None:
-                    board.phase("recording")
-                    view, begun = RecordingView(board, header, known, name=path.name), number
-                view.show(frame, number)
-                planned = header.provenance.get("images")
-                count = number + 1
-                if isinstance(planned, int) and planned >= count:
-                    board.count(count, planned, before=begun)
-            board.progress = replace(board.progress, phase="finished", left_s=None, busy=False)
-            report(f"{path} is finished with {count} images; the page stays until Ctrl-C")
-            threading.Event().wait()
-        except KeyboardInterrupt:
-            report("closed")

@@ -1,10 +1,9 @@
 """Figures of artefact evaluations: keys, calibrated values, uncertainty, verdicts; comparison of points with truth."""
 
 import dataclasses
-import math
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Annotated, Any, Literal, assert_never, get_args
+from typing import Annotated, Any, assert_never
 
 import numpy as np
 import pydantic
@@ -231,24 +230,6 @@ class ArtefactEvaluation:
             "vdi_range_mm": self.vdi_range_mm,
             "within_vdi_outliers": self.within_vdi_outliers,
         }
-
-
-Verdict = Literal["exceeds the limit", "undecided", "within the limit", "no limit"]
-VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
-"""Verdicts in order of severity."""
-
-
-def judge_interval(low: float, high: float, *, lower: float | None = None, upper: float | None = None) -> Verdict:
-    """Return the verdict on a coverage interval from ``low`` to ``high``: conformity and non-conformity are proven.
-
-    This is the decision rule of ISO 14253-1. An interval that contains a limit leaves the verdict undecided.
-    """
-    if lower is None and upper is None:
-        return "no limit"
-    least, most = -math.inf if lower is None else lower, math.inf if upper is None else upper
-    if least <= low and high <= most:
-        return "within the limit"
-    return "exceeds the limit" if high < least or low > most else "undecided"
 
 
 Count = Annotated[int, Field(ge=0)]

@@ -8,7 +8,7 @@ import threading
 import time
 from contextlib import suppress
 from ctypes import POINTER, byref, c_char_p, c_double, c_int, c_int64, c_size_t, c_uint, c_uint16, c_uint64, c_void_p
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from ipaddress import ip_address
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,18 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.errors import HardwareError, ImageError
+from uwlts.errors import HardwareError
 from uwlts.files.reading import log_warnings
 from uwlts.hardware.camera_interface import CameraDevice, CameraInfo, CameraSettings, Delivered
-from uwlts.model.stripe import Coordinates
 from uwlts.runtime.optional_library import load_aravis
 
 BUFFER_COMPLETE = 0  # ARV_BUFFER_STATUS_SUCCESS
-CENTRE_LINES = "Coord3D_C16"
-"""Pixel format of a 3D camera that extracts the stripe itself (GenICam Pixel Format Naming Convention 2.4)."""
-_LINE_RATE, _LINE_SELECTOR = "AcquisitionLineRate", "ChunkScanLineSelector"
-"""Features of 3D cameras: the profile rate in Hz, and the selector of the profile whose chunk data are read."""
-CHUNKS = ("EncoderValue", "Timestamp")  # requested chunk data; the name of each feature is prefixed with ``Chunk``
+_ENCODER = "EncoderValue"  # requested chunk data; the name of its feature is prefixed with ``Chunk``
 _PLAIN: dict[str, bool | int | float] = dict.fromkeys(["ReverseX", "ReverseY", "LUTEnable", "GammaEnable"], False)
 _PLAIN |= dict.fromkeys(["BinningHorizontal", "BinningVertical", "DecimationHorizontal", "DecimationVertical"], 1)
 _PLAIN |= {"Gamma": 1.0}
@@ -35,7 +30,6 @@ _PLAIN |= {"Gamma": 1.0}
 _BUFFERS = 32  # capacity of the queue of frames: half a second at 60 frames/s; further frames are lost
 _MONO_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono14": 14, "Mono16": 16}
 """Bit depths of the grey formats. Packed formats are omitted: few cameras offer only them."""
-_COORDINATE_BITS = 16  # bit depth of the values in `CENTRE_LINES`
 
 
 class _GError(ctypes.Structure):
@@ -69,7 +63,6 @@ _OF_CAMERA: tuple[tuple[Any, str, list[Any]], ...] = (
     (c_double, "get_float", [c_char_p]),
     (c_int, "get_boolean", [c_char_p]),
     (None, "set_boolean", [c_char_p, c_int]),
-    (c_char_p, "get_string", [c_char_p]),
 )
 # Result type, full names, and all arguments.
 _OTHERS: tuple[tuple[Any, str, list[Any]], ...] = (
@@ -95,7 +88,7 @@ _OTHERS: tuple[tuple[Any, str, list[Any]], ...] = (
 )
 
 
-_KINDS: dict[type, str] = {str: "string", float: "float", bool: "boolean", int: "integer"}
+_KINDS: dict[type, str] = {float: "float", bool: "boolean", int: "integer"}
 
 
 def _load_functions() -> SimpleNamespace:
@@ -180,8 +173,7 @@ class AravisCamera(CameraDevice):
         self._functions: SimpleNamespace
         self._camera: int | None = None
         self._stream: int | None = None
-        self._chunks: tuple[str, ...] = ()
-        self._by_line = False
+        self._has_encoder = False
         self._gone = False
 
     def _open(self) -> CameraInfo:
@@ -197,33 +189,16 @@ class AravisCamera(CameraDevice):
                 _decode(self._call(f"get_{part}")) or "?"
                 for part in ("vendor_name", "model_name", "device_serial_number")
             )
-            coordinates = self._read_coordinates() if self._read_pixel_format() == CENTRE_LINES else None
-            bits = _MONO_BITS.get(self._read_pixel_format(), 8) if coordinates is None else _COORDINATE_BITS
+            bits = _MONO_BITS.get(self._read_pixel_format(), 8)
             black = self._read_feature("BlackLevel", float)
         except BaseException:
             self._close()
             raise
-        return CameraInfo(f"{maker} {model}", serial, width, height, bits, coordinates, black)
+        return CameraInfo(f"{maker} {model}", serial, width, height, bits, black)
 
-    def _read_coordinates(self) -> Coordinates:
-        """Return the encoding of a 3D camera's values; raises HardwareError if they are not px of its image sensor."""
-        mode = self._read_feature("Scan3dOutputMode", str)
-        if mode is not None and not mode.startswith("Uncalibrated"):
-            raise HardwareError(
-                f"the 3D camera {self.address} gives {mode}, which is not in pixels of its image sensor: set its "
-                "Scan3dOutputMode to UncalibratedC, and calibrate it with `uwlts calibrate`"
-            )
-        scale, offset = (self._read_feature(f"Scan3dCoordinate{name}", float) for name in ("Scale", "Offset"))
-        marked = self._read_feature("Scan3dInvalidDataFlag", bool)
-        invalid = self._read_feature("Scan3dInvalidDataValue", float) if marked else None
-        return Coordinates(1.0 if scale is None else scale, offset or 0.0, invalid)
-
-    def _read_feature(self, name: str, kind: type[str] | type[float] | type[int]) -> Any:
+    def _read_feature(self, name: str, kind: type[float] | type[int]) -> Any:
         """Return the value of a camera feature, or None if the camera does not have it."""
-        if not self._offers(name):
-            return None
-        value = self._call(f"get_{_KINDS[kind]}", name.encode())
-        return _decode(value) if kind is str else value
+        return self._call(f"get_{_KINDS[kind]}", name.encode()) if self._offers(name) else None
 
     def _set_plain(self) -> None:
         """Switch off what mirrors, bins or bends the images; a calibration is for images without it."""
@@ -279,7 +254,7 @@ class AravisCamera(CameraDevice):
     def _close(self) -> None:
         things = [thing for thing in (self._stream, self._camera) if thing is not None]
         self._stream = self._camera = None
-        self._chunks = ()
+        self._has_encoder = False
         if self._gone:
             # Aravis repeats the release command for 10 s, during which the laser may have to be switched off.
             threading.Thread(target=self._let_go, args=(things,), name="aravis-let-go").start()
@@ -294,51 +269,40 @@ class AravisCamera(CameraDevice):
         self._call("set_acquisition_mode", 0)
         self._call("clear_triggers")
         self._set_plain()
-        if self.info.coordinates is None:
-            count = c_uint()
-            names = self._call("dup_available_pixel_formats_as_strings", byref(count))
-            offered = [names[index].decode() for index in range(count.value)]
-            self._functions.g_free(names)
-            name = f"Mono{wanted.bits}"
-            if name not in offered or name not in _MONO_BITS:
-                raise HardwareError(f"the camera {self.address} does not offer {name}, only {', '.join(offered)}")
-            self._call("set_pixel_format_from_string", name.encode())
-        self._set_chunks()
-        self._call("set_region", 0, 0, self.info.width_px, wanted.rows)
+        count = c_uint()
+        names = self._call("dup_available_pixel_formats_as_strings", byref(count))
+        offered = [names[index].decode() for index in range(count.value)]
+        self._functions.g_free(names)
+        name = f"Mono{wanted.bits}"
+        if name not in offered or name not in _MONO_BITS:
+            raise HardwareError(f"the camera {self.address} does not offer {name}, only {', '.join(offered)}")
+        self._call("set_pixel_format_from_string", name.encode())
+        self._request_counts()
+        self._call("set_region", 0, 0, self.info.width_px, self.info.height_px)
         exposure_us = None if wanted.exposure_ms is None else 1e3 * wanted.exposure_ms
         self._set_number("exposure_time", exposure_us, automatic="exposure")
         self._set_number("gain", wanted.gain_db, automatic="gain")
-        by_lines = self.info.coordinates is not None and self._offers(_LINE_RATE)
-        if by_lines and wanted.frame_rate_hz is not None:
-            self._call("set_float", _LINE_RATE.encode(), wanted.frame_rate_hz)
-        elif not by_lines:
-            self._set_number("frame_rate", wanted.frame_rate_hz)
+        self._set_number("frame_rate", wanted.frame_rate_hz)
         if wanted.trigger == "software":
             self._call("set_trigger", b"Software")
         exposure_us, gain, rate = (
             self._call(f"get_{feature}") if self._has(feature) else None
             for feature in ("exposure_time", "gain", "frame_rate")
         )
-        if by_lines:
-            rate = self._call("get_float", _LINE_RATE.encode())
         return CameraSettings(
             exposure_ms=None if exposure_us is None else 1e-3 * exposure_us,
             gain_db=gain,
-            rows=self._read_numbers("get_region", 4)[3],
-            bits=_MONO_BITS.get(self._read_pixel_format(), _COORDINATE_BITS),
+            bits=_MONO_BITS[self._read_pixel_format()],
             trigger=wanted.trigger,
             frame_rate_hz=rate,
         )
 
-    def _set_chunks(self) -> None:
-        """Request the chunk data of each frame, or of each of its profiles."""
-        if self._offers("ChunkModeActive"):
-            self._chunks = tuple(each for each in CHUNKS if self._offers(f"Chunk{each}"))
-        if self._chunks:
+    def _request_counts(self) -> None:
+        """Request the encoder count of each frame, if the camera has an encoder."""
+        self._has_encoder = self._offers("ChunkModeActive") and self._offers(f"Chunk{_ENCODER}")
+        if self._has_encoder:
             self._call("set_chunk_mode", 1)
-        for each in self._chunks:
-            self._call("set_chunk_state", each.encode(), 1)
-        self._by_line = self._offers(_LINE_SELECTOR)
+            self._call("set_chunk_state", _ENCODER.encode(), 1)
 
     def _set_number(self, feature: str, value: float | None, *, automatic: str | None = None) -> None:
         if value is None:
@@ -382,7 +346,7 @@ class AravisCamera(CameraDevice):
     def _trigger(self) -> None:
         self._call("software_trigger")
 
-    def _next(self, timeout_s: float) -> Delivered | None:
+    def _take_next(self, timeout_s: float) -> Delivered | None:
         functions, stream = self._functions, self._stream
         buffer = functions.arv_stream_timeout_pop_buffer(stream, int(1e6 * timeout_s))
         if buffer is None:
@@ -408,59 +372,20 @@ class AravisCamera(CameraDevice):
             return incomplete
         pixels = (ctypes.c_ubyte * needed).from_address(start)
         image = np.frombuffer(pixels, kind).reshape(height, width).astype(kind.newbyteorder("="))
-        if self.info.coordinates is None:
-            return Delivered(image, number, time_s, encoder=self._read_chunk(buffer, "ChunkEncoderValue", 0))
-        return self._read_profiles(image, number, time_s, buffer)
+        return Delivered(image, number, time_s, encoder=self._read_encoder(buffer))
 
-    def _read_profiles(self, numbers: np.ndarray, frame_id: int, time_s: float | None, buffer: int) -> Delivered:
-        """Return the frame of a 3D camera with one centre line for each row of its values (N, W).
-
-        Raises HardwareError if coordinates are outside the profile lines, or the time of a row is unknown.
-        """
-        meant, rows = self.info.coordinates or Coordinates(), range(len(numbers))
-        try:
-            lines = [meant.stripe(each, stripe_along="width", length_px=self.info.height_px) for each in numbers]
-        except ImageError as error:
-            raise HardwareError(f"the 3D camera {self.address}: {error}") from error
-        since_s = [0.0] if len(lines) == 1 else self._compute_times(rows, buffer)
-        first, *later = (
-            Delivered(
-                lines[row],
-                frame_id,
-                None if time_s is None else time_s + since_s[row],
-                encoder=self._read_chunk(buffer, "ChunkEncoderValue", row),
-            )
-            for row in rows
-        )
-        return replace(first, later=tuple(later))
-
-    def _compute_times(self, rows: range, buffer: int) -> list[float]:
-        """Return the times in s of a frame's profiles since the first, from their time stamps or the profile rate."""
-        stamps = [each for row in rows if (each := self._read_chunk(buffer, "ChunkTimestamp", row)) is not None]
-        # Some cameras have only one time stamp per frame.
-        if len(stamps) == len(rows) and stamps[-1] > stamps[0]:
-            return [1e-9 * (each - stamps[0]) for each in stamps]
-        if (rate_hz := self.settings.frame_rate_hz) is None:
-            raise HardwareError(
-                f"the 3D camera {self.address} gives neither a ChunkTimestamp for each profile nor its "
-                "AcquisitionLineRate, so that the times of its profiles are unknown: configure 1 profile per frame"
-            )
-        return [row / rate_hz for row in rows]
-
-    def _read_chunk(self, buffer: int, feature: str, row: int) -> int | None:
-        """Return the chunk value that came with a frame, or with one of its profiles, or None."""
+    def _read_encoder(self, buffer: int) -> int | None:
+        """Return the encoder count that came with a frame, or None."""
         functions = self._functions
-        if feature.removeprefix("Chunk") not in self._chunks or not functions.arv_buffer_has_chunks(buffer):
+        if not self._has_encoder or not functions.arv_buffer_has_chunks(buffer):
             return None
         device = functions.arv_camera_get_device(self._camera)
         functions.arv_gc_set_buffer(functions.arv_device_get_genicam(device), buffer)
         with suppress(HardwareError):
-            if self._by_line:
-                self._call("set_integer", _LINE_SELECTOR.encode(), row)
-            return self._call("get_integer", feature.encode())
+            return self._call("get_integer", f"Chunk{_ENCODER}".encode())
         return None
 
-    def _answers(self) -> None:
+    def _check_answer(self) -> None:
         self._read_numbers("get_region", 4)
 
     def _read_numbers(self, name: str, count: int) -> list[int]:

@@ -11,7 +11,7 @@ late, or follow frames that were lost in transfer.
 import math
 import time
 from abc import ABC, abstractmethod
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -23,7 +23,6 @@ import numpy as np
 
 from uwlts.errors import HardwareError, ImageError
 from uwlts.files.reading import is_regular_file, log_warnings, natural_key
-from uwlts.model.stripe import Coordinates, Stripe
 from uwlts.storage.capture import Capture
 from uwlts.storage.image_file import SUFFIXES, read_image
 
@@ -144,7 +143,6 @@ _MEANING = {
 class CameraInfo:
     """Identity of a camera: name, serial number, size of the image sensor, and bit depth.
 
-    ``coordinates`` is the encoding of a 3D camera's centre lines, or None if the camera delivers images.
     ``black_level`` is the camera's feature of this name, if it has one.
     """
 
@@ -153,7 +151,6 @@ class CameraInfo:
     width_px: int
     height_px: int
     bits: int
-    coordinates: Coordinates | None = None
     black_level: float | None = None
 
 
@@ -162,12 +159,10 @@ class CameraSettings:
     """Camera settings, either requested from a driver or in force.
 
     None in a request leaves a setting unchanged. None in a setting in force means that the camera does not report it.
-    ``rows`` is the height of an image, or the number of profiles in a frame.
     """
 
     exposure_ms: float | None
     gain_db: float | None
-    rows: int
     bits: int
     trigger: Trigger
     frame_rate_hz: float | None
@@ -177,43 +172,31 @@ class CameraSettings:
 class Delivered:
     """Frame from a driver, with the metadata that the camera reports.
 
-    ``seen`` is an image (H, W), a centre line, or None if the frame is incomplete. ``later`` holds the further centre
-    lines of a frame with several profiles, in order.
+    ``image`` is (H, W), or None if the frame is incomplete.
     """
 
-    seen: np.ndarray | Stripe | None
+    image: np.ndarray | None
     frame_id: int
     time_s: float | None = None
     exposure_ms: float | None = None
     encoder: int | None = None
-    later: tuple["Delivered", ...] = ()
 
 
 @dataclass(frozen=True)
 class GrabbedFrame:
-    """Complete frame: an image (H, W) of uint8 or uint16, or a centre line.
+    """Complete frame: an image (H, W) of uint8 or uint16.
 
     ``time_s`` is the time stamp of the camera's clock, whose origin is arbitrary. ``exposure_ms`` and ``encoder``, the
     count of an encoder wired to the camera, are None if the camera does not report them. ``status`` is OK, or DROPPED
     or LATE if the camera was started with ``faults="skip"``.
     """
 
-    seen: np.ndarray | Stripe
+    image: np.ndarray
     time_s: float
     frame_id: int
     exposure_ms: float | None
     status: FrameStatus
     encoder: int | None = None
-
-    @property
-    def image(self) -> np.ndarray:
-        """The image (H, W); raises HardwareError if the frame is a centre line."""
-        if isinstance(self.seen, Stripe):
-            raise HardwareError(
-                "the camera gives centre lines (Coord3D_C16) where an image is needed: set its PixelFormat to Mono8 "
-                "for targets and exposures"
-            )
-        return self.seen
 
 
 class CameraDevice(ABC):
@@ -230,7 +213,6 @@ class CameraDevice(ABC):
         self._started = False
         self._check = FrameCheck()
         self._skip = self._renumbering_said = False
-        self._later: deque[GrabbedFrame] = deque()
 
     @property
     def info(self) -> CameraInfo:
@@ -280,7 +262,6 @@ class CameraDevice(ABC):
         bits: int | None = None,
         trigger: Trigger = "free",
         frame_rate_hz: float | None = None,
-        profiles: int = 1,
     ) -> CameraSettings:
         """Configure the camera and return the settings in force, which may be rounded or limited.
 
@@ -291,10 +272,7 @@ class CameraDevice(ABC):
         trigger : {"free", "software"}
             Free running, or one frame for each call of ``trigger``.
         frame_rate_hz : float, optional
-            Frame rate of a free-running camera, or profile rate of a 3D camera; None leaves it unchanged.
-        profiles : int
-            Profiles in each frame of a free-running 3D camera. Each has its own time stamp and encoder count
-            (``ChunkScanLineSelector``), and ``grab`` returns them one by one.
+            Frame rate of a free-running camera; None leaves it unchanged.
         """
         info = self.info
         if self._started:
@@ -304,12 +282,9 @@ class CameraDevice(ABC):
                 raise HardwareError(f"{name} is {value}: expected a positive number")
         if gain_db is not None and not np.isfinite(gain_db):
             raise HardwareError(f"gain_db is {gain_db}: expected a finite number")
-        if profiles < 1 or (profiles > 1 and (info.coordinates is None or trigger != "free")):
-            raise HardwareError(f"profiles is {profiles}: expected 1, or more for a free-running 3D camera")
         if bits is None:
             bits = info.bits if self._settings is None else self._settings.bits
-        rows = info.height_px if info.coordinates is None else profiles
-        settings = self._configure(CameraSettings(exposure_ms, gain_db, rows, bits, trigger, frame_rate_hz))
+        settings = self._configure(CameraSettings(exposure_ms, gain_db, bits, trigger, frame_rate_hz))
         self._settings = settings if trigger == "free" else replace(settings, frame_rate_hz=None)
         return self._settings
 
@@ -322,10 +297,8 @@ class CameraDevice(ABC):
         settings = self.settings
         if self._started:
             raise HardwareError(f"the camera {self.address} is running already")
-        together = 1 if self.info.coordinates is None else settings.rows
-        period_s = together / settings.frame_rate_hz if settings.frame_rate_hz else None
+        period_s = 1.0 / settings.frame_rate_hz if settings.frame_rate_hz else None
         self._check = FrameCheck(period_s=period_s, triggered=settings.trigger == "software")
-        self._later.clear()
         self._skip = faults == "skip"
         self._start()
         self._started = True
@@ -343,8 +316,7 @@ class CameraDevice(ABC):
             raise HardwareError(
                 f"the camera {self.address} is configured for trigger '{self.settings.trigger}', not 'software'"
             )
-        self._later.clear()
-        while self._next(0.0) is not None:
+        while self._take_next(0.0) is not None:
             self._check.restart_comparison("late")
         self._trigger()
 
@@ -355,39 +327,36 @@ class CameraDevice(ABC):
         unanswered trigger restarts the acquisition, so that its frame cannot be mistaken for the answer to a later one.
         """
         self._require_running()
-        if self._later:
-            return self._later.popleft()
         deadline = time.monotonic() + timeout_s
         while True:
             left_s = max(deadline - time.monotonic(), 0.0)
-            frame = self._next(min(left_s, _WAIT_S))
+            frame = self._take_next(min(left_s, _WAIT_S))
             if frame is None:
                 if left_s > _WAIT_S:
                     waiting()
                     continue
                 raise self._explain_no_frame(timeout_s)
-            status = self._check.judge(frame_id=frame.frame_id, time_s=frame.time_s, complete=frame.seen is not None)
+            status = self._check.judge(frame_id=frame.frame_id, time_s=frame.time_s, complete=frame.image is not None)
             if self.counts.renumbered and not self._renumbering_said:
                 self._renumbering_said = True
                 log_warnings(self.address, ["its frame numbers jump: time stamps or triggers show which are lost"])
             usable = status is FrameStatus.OK or (self._skip and status is not FrameStatus.DUPLICATED)
-            if frame.seen is not None and usable:
-                self._later.extend(self._make_grabbed_frame(each, FrameStatus.OK) for each in frame.later)
+            if frame.image is not None and usable:
                 return self._make_grabbed_frame(frame, status)
             if not self._skip:
                 raise HardwareError(f"frame {frame.frame_id} of the camera {self.address} is {_MEANING[status]}")
 
     def _make_grabbed_frame(self, frame: Delivered, status: FrameStatus) -> GrabbedFrame:
-        settings, seen = self.settings, frame.seen
-        assert seen is not None
-        if isinstance(seen, np.ndarray) and seen.shape != (settings.rows, self.info.width_px):
+        image, info = frame.image, self.info
+        assert image is not None
+        if image.shape != (info.height_px, info.width_px):
             raise HardwareError(
-                f"frame {frame.frame_id} of the camera {self.address} has {seen.shape[1]} x {seen.shape[0]} px, "
-                f"expected {self.info.width_px} x {settings.rows} px"
+                f"frame {frame.frame_id} of the camera {self.address} has {image.shape[1]} x {image.shape[0]} px, "
+                f"expected {info.width_px} x {info.height_px} px"
             )
         time_s = time.monotonic() if frame.time_s is None else frame.time_s
-        exposure_ms = settings.exposure_ms if frame.exposure_ms is None else frame.exposure_ms
-        return GrabbedFrame(seen, time_s, frame.frame_id, exposure_ms, status, frame.encoder)
+        exposure_ms = self.settings.exposure_ms if frame.exposure_ms is None else frame.exposure_ms
+        return GrabbedFrame(image, time_s, frame.frame_id, exposure_ms, status, frame.encoder)
 
     def _explain_no_frame(self, timeout_s: float) -> HardwareError:
         """Return the error for a missing frame; raises another HardwareError if the camera is gone."""
@@ -402,7 +371,7 @@ class CameraDevice(ABC):
                 f"the camera {self.address} did not answer a trigger within {timeout_s:g} s; its exposure is "
                 f"{self.settings.exposure_ms} ms. It still answers commands: the frame or the trigger was lost"
             )
-        self._answers()
+        self._check_answer()
         self._started = True
         return HardwareError(
             f"the camera {self.address} gave no frame within {timeout_s:g} s though it answers commands: its frames "
@@ -445,11 +414,11 @@ class CameraDevice(ABC):
         """Trigger one frame."""
 
     @abstractmethod
-    def _next(self, timeout_s: float) -> Delivered | None:
+    def _take_next(self, timeout_s: float) -> Delivered | None:
         """Return the next frame, or None if none arrives within ``timeout_s`` (at most 0.1 s)."""
 
     @abstractmethod
-    def _answers(self) -> None:
+    def _check_answer(self) -> None:
         """Raise HardwareError if the camera is gone."""
 
 
@@ -469,7 +438,7 @@ class ReplayCamera(CameraDevice):
         self._triggered = False
 
     def _open(self) -> CameraInfo:
-        self._shown, coordinates = 0, None
+        self._shown = 0
         if self._path.is_dir():
             images = (path for path in self._path.iterdir() if path.suffix.lower() in SUFFIXES)
             self._files = sorted(images, key=lambda path: natural_key(path.name))
@@ -484,10 +453,9 @@ class ReplayCamera(CameraDevice):
                 raise HardwareError(f"the capture {self._path} contains no frame")
             sensor = self._capture.header.sensor
             height, width, bits = sensor.camera.height_px, sensor.camera.width_px, sensor.detector.bits
-            coordinates = None if self._capture.has_image.all() else Coordinates()
         else:
             raise HardwareError(f"{self._path} is neither a folder of images nor a capture")
-        return CameraInfo(f"replay of {self._path.name}", self._path.name, width, height, bits, coordinates)
+        return CameraInfo(f"replay of {self._path.name}", self._path.name, width, height, bits)
 
     def _close(self) -> None:
         capture, self._capture, self._files = self._capture, None, []
@@ -511,7 +479,7 @@ class ReplayCamera(CameraDevice):
     def _trigger(self) -> None:
         self._triggered = True
 
-    def _next(self, timeout_s: float) -> Delivered | None:
+    def _take_next(self, timeout_s: float) -> Delivered | None:
         if self.settings.trigger == "software":
             if not self._triggered:
                 time.sleep(timeout_s)
@@ -525,11 +493,8 @@ class ReplayCamera(CameraDevice):
         count = len(self._files) if capture is None else len(capture)
         if shown >= count:
             raise HardwareError(f"all {count} images of {self._path} have been shown")
-        seen = _read_image(self._files[shown]) if capture is None else capture.read_observation(shown)
+        image = _read_image(self._files[shown]) if capture is None else capture.image(shown)
         exposure_ms = None if capture is None else float(capture.exposure_ms[shown])
-        if isinstance(image := seen, Stripe):
-            known = math.nan if capture is None else float(capture.encoder[shown])
-            return Delivered(seen, shown + 1, stamp_s, exposure_ms, int(known) if math.isfinite(known) else None)
         if image.shape != (info.height_px, info.width_px) or image.dtype.itemsize != (1 if info.bits == 8 else 2):
             raise ImageError(
                 f"image {shown} of {self._path} has {image.shape[1]} x {image.shape[0]} px of {image.dtype}, "
@@ -537,7 +502,7 @@ class ReplayCamera(CameraDevice):
             )
         return Delivered(image, shown + 1, stamp_s, exposure_ms)
 
-    def _answers(self) -> None:
+    def _check_answer(self) -> None:
         """Files need no check: reading a missing one raises an error."""
 
 

@@ -30,7 +30,7 @@ from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import Frame
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.numbering import unwrap_counts
-from uwlts.stripe import find_stripe, warm_up
+from uwlts.stripe import extract_stripe, warm_up
 
 _SPARE_MM, _SPARE_S = 1.0, 0.3
 """Travel at constant speed before and after the stored frames: a distance, and in addition a time."""
@@ -116,21 +116,19 @@ def record_continuously(
             f"at {continuous.speed_mm_per_s:g} mm/s the camera has {1e3 / rate_hz:.3g} ms for a step of "
             f"{abs(plan.stage.step_mm):g} mm, too little for an exposure of {exposure_ms:.3g} ms: travel more slowly"
         )
-    expected, lines = len(positions) * len(passes), camera.info.coordinates is not None
-    dtype = np.dtype(np.uint16 if camera.info.bits > 8 and not lines else np.uint8)
+    expected = len(positions) * len(passes)
+    dtype = np.dtype(np.uint16 if camera.info.bits > 8 else np.uint8)
     settings = {"exposure_ms": exposure_ms, "gain_db": plan.gain_db, "bits": sensor.detector.bits}
     camera.stop()
     warm_up()  # before the laser is on: the first image would hold up the frames after it
     stage.move_to(passes[0][0], feed_mm_per_min=plan.stage.feed_mm_per_min)
     offset_s, encoder = _compare_clocks(camera, **settings)
     at_rest_mm = stage.position_mm()
-    together = continuous.profiles_per_frame
-    rate_set = camera.configure(**settings, frame_rate_hz=rate_hz, profiles=together).frame_rate_hz
+    rate_set = camera.configure(**settings, frame_rate_hz=rate_hz).frame_rate_hz
     if rate_set is None or abs(rate_set / rate_hz - 1) > 0.01:
         warn(f"the camera takes {rate_set} frames/s where the plan needs {rate_hz:.4g}: steps differ from the plan's")
-    kinds = {"centre_lines": lines, "moving": True}
-    with CaptureWriter(out, header, dtype=dtype, **kinds, plan=plan.make_record(), overwrite=overwrite) as writer:
-        frame_s, within = 1e-3 * exposure_ms + together / rate_hz, (min(positions), max(positions))
+    with CaptureWriter(out, header, dtype=dtype, moving=True, plan=plan.make_record(), overwrite=overwrite) as writer:
+        frame_s, within = 1e-3 * exposure_ms + 1.0 / rate_hz, (min(positions), max(positions))
         braking_s = continuous.speed_mm_per_s / stage.settings.acceleration_mm_per_s2
 
         def stored(frame: Frame, stripe: Stripe, number: int) -> None:
@@ -252,22 +250,21 @@ class _FrameReader:
         known = [each for one in list(self._passes) for each in list(one)]
         if not known:
             return
-        times, places = np.array([_time_of(each) for each in known]), [each.position_mm for each in known]
+        times, places = np.array([_date(each) for each in known]), [each.position_mm for each in known]
         while self._pending and (self._pending[0][1] < times[-1] or self.end_s is not None):
             frame, middle_s = self._pending.popleft()
             place = float(np.interp(middle_s, times, places))
             if not (self._within_mm[0] <= place <= self._within_mm[1] and times[0] <= middle_s <= times[-1]):
                 continue
-            encoder = None if frame.encoder is None else float(frame.encoder)
             exposure_ms = self._exposure_ms if frame.exposure_ms is None else frame.exposure_ms
-            kept = Frame(frame.seen, place, True, exposure_ms, middle_s - self._began_s, encoder=encoder)
+            kept = Frame(frame.image, place, True, exposure_ms, middle_s - self._began_s)
             self._writer.append(kept)
             header = self._writer.header
             along, full_dn = header.sensor.camera.stripe_along, header.saturation_dn
-            stripe = find_stripe(frame.seen, stripe_along=along, saturation=full_dn)
+            stripe = extract_stripe(frame.image, stripe_along=along, saturation=full_dn)
             self._stripes.append(stripe.centre_px)
             self._times.append(middle_s)
-            self._encoders.append(np.nan if encoder is None else encoder)
+            self._encoders.append(np.nan if frame.encoder is None else frame.encoder)
             self._stored(kept, stripe, len(self._times) - 1)
 
     def assign_positions(
@@ -291,7 +288,7 @@ class _FrameReader:
             )
         stage, speed, scatters, speeds = np.full(len(times), np.nan), np.zeros(len(times)), [], []
         for one in self._passes:
-            within = (times >= _time_of(one[0])) & (times <= _time_of(one[-1])) if one else np.zeros(len(times), bool)
+            within = (times >= _date(one[0])) & (times <= _date(one[-1])) if one else np.zeros(len(times), bool)
             if not within.any():
                 continue
             constant = [each for each in one if even[0] <= each.position_mm <= even[1]]
@@ -314,7 +311,7 @@ class _FrameReader:
             except EvaluationError as error:
                 warn(f"the latency of the stage is unknown and taken as 0: {error}")
         stage = stage + speed * latency_s
-        reports = [(_time_of(each) - self._began_s, each.position_mm) for one in self._passes for each in one]
+        reports = [(_date(each) - self._began_s, each.position_mm) for one in self._passes for each in one]
         self._writer.place(stage, speed, np.array(reports))
         known = "as given" if std_s is None else f"measured, std {1e3 * std_s:.3f} ms"
         return (
@@ -323,7 +320,7 @@ class _FrameReader:
         )
 
 
-def _time_of(report: StageReport) -> float:
+def _date(report: StageReport) -> float:
     return 0.5 * (report.asked_s + report.answered_s)
 
 
@@ -342,7 +339,7 @@ def _fit_line(reports: list[StageReport], at_s: np.ndarray) -> tuple[np.ndarray,
     took = np.sort([each.answered_s - each.asked_s for each in reports])
     longest = max(_SLOW_REPORT * took[0], took[max(len(reports) // 2, _FEWEST_REPORTS - 1)])
     used = [each for each in reports if each.answered_s - each.asked_s <= longest]
-    times, places = np.array([_time_of(each) for each in used]), np.array([each.position_mm for each in used])
+    times, places = np.array([_date(each) for each in used]), np.array([each.position_mm for each in used])
     middle, kept, speed, start = times.mean(), np.ones(len(used), bool), 0.0, 0.0
     outside, fitted = places, kept
     for _ in range(3):

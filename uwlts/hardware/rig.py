@@ -21,7 +21,7 @@ from uwlts.hardware.camera_interface import CameraDevice, GrabbedFrame
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.scan_plan import Light, RigPlan, StageSettings
 from uwlts.model.sensor import Sensor
-from uwlts.storage.capture import CaptureHeader, Seen
+from uwlts.storage.capture import CaptureHeader
 from uwlts.stripe import Stripe, StripeStatus, extract_stripe
 
 BRIGHT_SHARE = 0.98
@@ -39,12 +39,10 @@ _DOWN = 1 / 16  # factor after a saturated image, whose excess is unknown
 _UP = 30.0  # largest factor after a dark image, because noise limits the estimate
 
 
-def get_stripe(seen: Seen, sensor: Sensor, *, background: np.ndarray | None = None) -> Stripe:
-    """Return a centre line unchanged, or extract the stripe of an image (H, W) minus a background (H, W), if given."""
-    if isinstance(seen, Stripe):
-        return seen
+def get_stripe(image: np.ndarray, sensor: Sensor, *, background: np.ndarray | None = None) -> Stripe:
+    """Extract the stripe of an image (H, W) minus a background (H, W), if given."""
     along, full_dn = sensor.camera.stripe_along, sensor.detector.full_scale_dn()
-    return extract_stripe(seen, stripe_along=along, saturation=full_dn, background=background)
+    return extract_stripe(image, stripe_along=along, saturation=full_dn, background=background)
 
 
 def are_enough(count: int, lines: int) -> bool:
@@ -76,13 +74,8 @@ class Brightness:
         return self.saturated > _MANY_SHARE * self.counted and are_enough(self.saturated, self.lines)
 
 
-def measure_brightness(image: Seen, sensor: Sensor, light: Light) -> Brightness:
-    """Measure the brightness of an image (H, W) in grey values of the sensor's detector.
-
-    For a centre line only the number of lines is known, and the level is NaN.
-    """
-    if isinstance(image, Stripe):
-        return Brightness(len(image.status), len(image.lines), 0, math.nan)
+def measure_brightness(image: np.ndarray, sensor: Sensor, light: Light) -> Brightness:
+    """Measure the brightness of an image (H, W) in grey values of the sensor's detector."""
     full, black = sensor.detector.full_scale_dn(), sensor.detector.black_level_dn
     peak = image.max(axis=0 if sensor.camera.stripe_along == "width" else 1).astype(float)
     counts = peak - black > _DIM_SHARE * (peak.max() - black)
@@ -231,9 +224,9 @@ class Rig:
         return self._read_back_mm
 
     def frame(self, light: Light, exposure_ms: float) -> GrabbedFrame:
-        """Take a frame in a light, "lamp" being without laser: an image or a centre line."""
+        """Take a frame in a light, "lamp" being without laser."""
         if self._exposure_ms is None or abs(self._exposure_ms / exposure_ms - 1) >= 1e-6:
-            self._rest()
+            self._darken()
             camera, gain_db, bits = self._camera, self._plan.gain_db, self._sensor.detector.bits
             camera.stop()
             camera.configure(exposure_ms=exposure_ms, gain_db=gain_db, bits=bits, trigger="software")
@@ -255,7 +248,7 @@ class Rig:
             longest_s = 1e-3 * (self._exposure_ms or 0.0) + _LIGHT_S
             self._stage.laser(on, power=self._plan.laser_power, at_most_s=longest_s)
 
-    def _rest(self) -> None:
+    def _darken(self) -> None:
         """Switch the laser off; an operator is asked only before an image without laser."""
         if not isinstance(self._stage, HandSwitchedLaser):
             self._switch_laser(False)
@@ -271,7 +264,7 @@ class Rig:
             except HardwareError as error:
                 # Switch off first: closing a camera that is gone takes time.
                 with suppress(HardwareError):
-                    self._rest()
+                    self._darken()
                 # If the camera's driver hangs, the guard switches the laser off; the fault to report is the camera's.
                 if self._stage.faulty or not self._camera.running:
                     raise
@@ -280,7 +273,7 @@ class Rig:
                 self.repeated += 1
             else:
                 # Also checks whether the laser was on all the time.
-                self._rest()
+                self._darken()
                 return frame
 
     def _take_one(self) -> GrabbedFrame:
@@ -295,7 +288,7 @@ class Rig:
             if time.monotonic() < lit_until_s:
                 self._stage.keep_lit()
             else:
-                self._rest()
+                self._darken()
 
         frame = self._camera.grab(_PATIENCE_S + exposure_s, waiting=waiting)
         came_s, known = time.monotonic(), len(self._latencies_s) > 0
@@ -305,7 +298,7 @@ class Rig:
         if not lit or came_s <= lit_until_s:
             return frame
         # Before anything else: it shows whether the guard, not the controller, has ended the light.
-        self._rest()
+        self._darken()
         if not (known and began_s + exposure_s + _PROMPT_S < lit_until_s):
             raise HardwareError(
                 f"the camera {self._camera.address} gave a frame {came_s - asked_s:.2g} s after its trigger, and the "

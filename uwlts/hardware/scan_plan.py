@@ -120,8 +120,7 @@ class Continuous(Description):
     With ``both_ways`` the stage also travels back, which measures the latency between camera and stage. Alternatively
     ``latency_ms`` gives the age of the stage's positions relative to the frames. ``mm_per_count`` assigns positions by
     an encoder that is wired to the camera and sent with the frames (GenICam's ChunkEncoderValue), a counter of
-    ``encoder_bits`` (`uwlts.storage.numbering`). A 3D camera sends
-    ``profiles_per_frame`` profiles together: larger values reduce the load on network and computer.
+    ``encoder_bits`` (`uwlts.storage.numbering`).
     """
 
     speed_mm_per_s: Positive
@@ -129,7 +128,6 @@ class Continuous(Description):
     latency_ms: float | None = None
     mm_per_count: float | None = None
     encoder_bits: Annotated[int, Field(ge=8, le=52)] | None = None
-    profiles_per_frame: Annotated[int, Field(ge=1, le=10000)] = 1
 
 
 class ScanPlan(RigPlan):

@@ -13,7 +13,6 @@ import numpy as np
 from uwlts.fitting.least_squares import robust_std
 from uwlts.hardware.rig import are_enough, get_stripe
 from uwlts.model.sensor import Sensor
-from uwlts.storage.capture import Seen
 from uwlts.stripe import Stripe, StripeStatus
 from uwlts.stripe.capture_stripes import FEWEST_LINES
 
@@ -28,16 +27,12 @@ def select_evenly(positions_mm: Sequence[float], count: int) -> list[float]:
     return [positions_mm[k] for k in chosen]
 
 
-def shows_laser(lit: Seen, unlit: Seen, sensor: Sensor, *, difference: bool) -> bool:
+def shows_laser(lit: np.ndarray, unlit: np.ndarray, sensor: Sensor, *, difference: bool) -> bool:
     """Return whether an image has a stripe that the image (H, W) at the same position without laser does not have.
 
-    The same applies to two centre lines. With ``difference`` the stripe is extracted from the difference. Otherwise
+    With ``difference`` the stripe is extracted from the difference. Otherwise
     it must also be in the image itself, because a lamp that is on only while the laser is off leaves a difference.
     """
-    if isinstance(lit, Stripe) or isinstance(unlit, Stripe):
-        with_laser, without = (select_centres(get_stripe(each, sensor)) for each in (lit, unlit))
-        changed = np.isfinite(with_laser) & ~(np.abs(with_laser - without) < _SAME_PX)
-        return are_enough(int(changed.sum()), len(changed))
     full = sensor.detector.full_scale_dn()
     added = get_stripe(lit, sensor, background=unlit)
     shown = added.status == StripeStatus.OK
@@ -95,7 +90,7 @@ class SlipWatch:
         with np.errstate(invalid="ignore"):
             steep = (np.abs(motion) > _LEAST_RELIEF) & (np.abs(bend) < _LARGEST_BEND_PX)
         # The bend has six times the variance of a centre, and a slip twice that variance.
-        if steep.sum() >= FEWEST_LINES and _standard_error(bend[steep] / np.sqrt(3), motion[steep]) <= LARGEST_MM / 3:
+        if steep.sum() >= FEWEST_LINES and _estimate_error(bend[steep] / np.sqrt(3), motion[steep]) <= LARGEST_MM / 3:
             self.place, self._motion_px_per_mm = here, np.where(steep, motion, np.nan)
 
     def measure_slip(self, again: np.ndarray) -> tuple[float, float]:
@@ -114,7 +109,7 @@ class SlipWatch:
         order = np.argsort(slips)
         heaped = np.cumsum(weights[order])
         slip_mm = float(slips[order][np.searchsorted(heaped, heaped[-1] / 2)])
-        return slip_mm, _standard_error(shift - slip_mm * motion, motion)
+        return slip_mm, _estimate_error(shift - slip_mm * motion, motion)
 
     def is_significant(self, slip_mm: float, error_mm: float) -> bool:
         """Return whether a slip exceeds `LARGEST_MM` and its uncertainty."""
@@ -126,7 +121,7 @@ def select_centres(stripe: Stripe) -> np.ndarray:
     return np.where(stripe.status == StripeStatus.OK, stripe.centre_px, np.nan)
 
 
-def _standard_error(scatter_px: np.ndarray, motion_px_per_mm: np.ndarray) -> float:
+def _estimate_error(scatter_px: np.ndarray, motion_px_per_mm: np.ndarray) -> float:
     """Return the standard error in mm of the slip from all lines."""
     spread = robust_std(scatter_px - np.median(scatter_px))
     return float(_GRAIN * spread / np.sqrt(np.sum(motion_px_per_mm**2)))

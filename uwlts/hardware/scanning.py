@@ -21,7 +21,7 @@ from uwlts.hardware.rig import START_MS, Brightness, Rig, add_provenance, get_st
 from uwlts.hardware.scan_plan import Light, ScanPlan
 from uwlts.hardware.scan_watch import LOOKS, LitPlace, Place, SlipWatch, select_centres, select_evenly, shows_laser
 from uwlts.model.sensor import Sensor
-from uwlts.storage.capture import Capture, Frame, Seen, part_path
+from uwlts.storage.capture import Capture, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.import_.grey_values import subtract_background
 from uwlts.stripe import Stripe, StripeStatus
@@ -107,11 +107,8 @@ def record_scan(
     )
     sensor = plan.described_sensor()
     check_camera(camera, sensor)
-    lines = camera.info.coordinates is not None
-    if lines:
-        check_lines_plan(plan)
     plan.check(stage)
-    dtype = np.dtype(np.uint16 if plan.background or (camera.info.bits > 8 and not lines) else np.uint8)
+    dtype = np.dtype(np.uint16 if plan.background or camera.info.bits > 8 else np.uint8)
     header = add_provenance(
         plan.header(out.stem),
         plan,
@@ -150,8 +147,7 @@ def record_scan(
         return seen
     known_ms, before_s = read_unfinished(out, [multiple for _, multiple in plan.images()]) if resume else ({}, 0.0)
     seen = ScanProgress(exposure_ms=known_ms)
-    files = {"overwrite": overwrite, "resume": resume}
-    with CaptureWriter(out, header, dtype=dtype, centre_lines=lines, plan=plan.make_record(), **files) as writer:
+    with CaptureWriter(out, header, dtype=dtype, plan=plan.make_record(), overwrite=overwrite, resume=resume) as writer:
         begun = len(writer)
         if begun == len(shots):
             return seen
@@ -160,8 +156,8 @@ def record_scan(
         for done, (position_mm, (light, multiple)) in enumerate(shots[begun:], begun + 1):
             between()
             taken = taking.take(position_mm, light, multiple, last=done == len(shots))
-            kept = taken.seen if isinstance(taken.seen, Stripe) else taken.seen.astype(dtype, copy=False)
-            frame = replace(taken, seen=kept, time_s=time.monotonic() - start_s)
+            image = taken.image.astype(dtype, copy=False)
+            frame = replace(taken, image=image, time_s=time.monotonic() - start_s)
             writer.append(frame)
             listeners.progress(done, len(shots))
             listeners.recorded(frame, done - 1)
@@ -194,29 +190,9 @@ def check_camera(camera: CameraDevice, sensor: Sensor) -> None:
             f"the camera has {found.width_px} x {found.height_px} px, the sensor '{sensor.name}' "
             f"{described.width_px} x {described.height_px} px: give the description of this camera's sensor"
         )
-    if found.coordinates is not None and described.stripe_along != "width":
-        raise HardwareError(
-            f"the 3D camera's profile lines are its columns, but the sensor '{sensor.name}' has stripe_along = "
-            f"'{described.stripe_along}': give the description with \"width\""
-        )
     if found.bits < sensor.detector.bits:
         raise HardwareError(
             f"the camera gives {found.bits} bits, the sensor '{sensor.name}' is described with {sensor.detector.bits}"
-        )
-
-
-def check_lines_plan(plan: ScanPlan) -> None:
-    """Raise DescriptionError if a plan needs images but the camera delivers centre lines."""
-    needs = {
-        "lights holds 'lamp'": "lamp" in plan.lights,
-        "background is true": plan.background,
-        "laser_ms is 'auto'": "laser" not in plan.planned_ms(),
-        "bracket has several exposures": len(plan.bracket) > 1,
-    }
-    if wrong := [name for name, found in needs.items() if found]:
-        raise DescriptionError(
-            f"the camera extracts the stripe itself and gives no images (Coord3D_C16), but {' and '.join(wrong)}: "
-            "change the plan, or set the camera's PixelFormat to Mono8"
         )
 
 
@@ -286,7 +262,7 @@ class _Taking:
         position = rig.move_to(position_mm)
         asked_ms = seen.exposure_ms[light] * multiple
         frame = rig.frame(light, asked_ms)
-        bright = measure_brightness(frame.seen, self._sensor, light)
+        bright = measure_brightness(frame.image, self._sensor, light)
         if (
             multiple == 1
             and bright.overexposed
@@ -295,8 +271,8 @@ class _Taking:
         ):
             asked_ms = seen.exposure_ms[light]
             frame = rig.frame(light, asked_ms)
-            bright = measure_brightness(frame.seen, self._sensor, light)
-        image, exposure_ms = frame.seen, asked_ms if frame.exposure_ms is None else frame.exposure_ms
+            bright = measure_brightness(frame.image, self._sensor, light)
+        image, exposure_ms = frame.image, asked_ms if frame.exposure_ms is None else frame.exposure_ms
         unlit = rig.frame("lamp", exposure_ms).image if zero_dn and light == "laser" else None
         if light == "laser" and multiple == 1:
             stripe, place = get_stripe(image, self._sensor, background=unlit), LitPlace(position_mm, exposure_ms)
@@ -304,19 +280,19 @@ class _Taking:
             self._check_laser(image, stripe, bright.level, place, unlit=unlit, last=last)
             self._count(stripe, bright)
         seen.repeated = rig.repeated
-        if zero_dn and isinstance(image, np.ndarray):
+        if zero_dn:
             clipped = image >= self._sensor.detector.full_scale_dn()
             lit = image.astype(np.uint16)
             image = lit if unlit is None else subtract_background(image, unlit, clipped, zero_dn=zero_dn)
-        return Frame(image, position, light == "laser", exposure_ms, 0.0, encoder=frame.encoder)
+        return Frame(image, position, light == "laser", exposure_ms, 0.0)
 
-    def _shows_laser(self, lit: Seen, unlit: Seen) -> bool:
+    def _shows_laser(self, lit: np.ndarray, unlit: np.ndarray) -> bool:
         return shows_laser(lit, unlit, self._sensor, difference=self._plan.background)
 
     def _check_laser(
-        self, image: Seen, stripe: Stripe, level: float, here: LitPlace, *, unlit: np.ndarray | None, last: bool
+        self, image: np.ndarray, stripe: Stripe, level: float, here: LitPlace, *, unlit: np.ndarray | None, last: bool
     ) -> None:
-        """Check that the laser emitted light in an image or centre line, before it is stored. The stage may move.
+        """Check that the laser emitted light in an image (H, W), before it is stored. The stage may move.
 
         ``level`` is the brightness of the stripe, which is compared with that of the image before. ``unlit`` (H, W) is
         an image without laser at the same position; if missing, it is taken when it is needed. No further image follows
@@ -324,7 +300,7 @@ class _Taking:
         """
         now = (int((stripe.status != StripeStatus.NO_STRIPE).sum()), level)
         if self._usual is None or any(a < _DROP * b for a, b in zip(now, self._usual, strict=True)):
-            dark = self._rig.frame("lamp", here.exposure_ms).seen if unlit is None else unlit
+            dark = self._rig.frame("lamp", here.exposure_ms).image if unlit is None else unlit
             if not self._shows_laser(image, dark):
                 self._without += 1
                 if last or self._without % _AGAIN == 1:
@@ -337,7 +313,7 @@ class _Taking:
         others = [position for position in select_evenly(self._positions_mm, LOOKS) if position != here.position_mm]
         for place in [self._lit] if self._lit else [LitPlace(position, here.exposure_ms) for position in others]:
             self._rig.move_to(place.position_mm)
-            lit, unlit = (self._rig.frame(light, place.exposure_ms).seen for light in ("laser", "lamp"))
+            lit, unlit = (self._rig.frame(light, place.exposure_ms).image for light in ("laser", "lamp"))
             if self._shows_laser(lit, unlit):
                 self._lit = place
                 self._rig.move_to(here.position_mm)
@@ -365,7 +341,7 @@ class _Taking:
         if (place := self._slip.place) is None:
             return
         self._rig.move_to(place.position_mm)
-        image = self._rig.frame("laser", place.exposure_ms).seen
+        image = self._rig.frame("laser", place.exposure_ms).image
         unlit = self._rig.frame("lamp", place.exposure_ms).image if self._plan.background else None
         slip_mm, error_mm = self._slip.measure_slip(select_centres(get_stripe(image, self._sensor, background=unlit)))
         if not np.isfinite(slip_mm):

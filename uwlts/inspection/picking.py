@@ -1,16 +1,30 @@
-"""Lengths, shapes and sections measured at picked places of a cloud or in profiles of images, with uncertainty."""
+"""Measurements by hand: lengths, shapes and sections at picked places of a cloud or in images, and lists of the values.
 
-from collections.abc import Callable
+Lists have limits, verdicts by the whole intervals, and files.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from pathlib import Path
+from typing import Annotated, Literal, Self
 
 import numpy as np
+from pydantic import ConfigDict, Field, computed_field, model_validator
 
-from uwlts.errors import EvaluationError
+from uwlts.errors import DescriptionError, EvaluationError
 from uwlts.evaluation.figure_uncertainty import propagate_figures
 from uwlts.evaluation.figures import FigureUncertainty
+from uwlts.files.json_files import read_model, write_model
 from uwlts.fitting.least_squares import fit_robustly
 from uwlts.fitting.propagation import PointErrors, noise_shifts
+from uwlts.inspection.findings_order import Verdict, judge_interval
+from uwlts.model.library import validate_description
+from uwlts.model.sensor import Description
+from uwlts.pages.toolkit import MISSING, format_to_scale
 from uwlts.shapes.cylinder import Cylinder
 from uwlts.shapes.flat import Plane
 from uwlts.shapes.sphere import Sphere
@@ -203,3 +217,155 @@ def measure_step(section: Section, first_mm: float, second_mm: float, *, width_m
 
     stated = _state_uncertainty(section.cloud, used, measure)
     return PickedMeasurement("step", measure(section.cloud.points_mm[used]), stated, len(used), 0)
+
+
+FORMAT = "uwlts-measured-values"
+VERSION = 1  # of the file format
+MEASURED_ENDINGS = (".measured.html", ".measured.json", ".measured.csv")
+"""Endings of page, list and table."""
+COLUMNS = ("name", "quantity", "value / mm", "U (k = 2) / mm", "lower limit", "upper limit", "verdict", "source")
+_SHOWN_MM = 1e-4
+"""Precision of values without uncertainty."""
+
+
+class MeasuredValue(Description):
+    """Value measured by hand."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    number: int  # number of the value in its list
+    name: Annotated[str, Field(min_length=1, max_length=100)]  # name given by the user
+    quantity: str  # measured quantity, such as "distance" or "diameter"
+    value_mm: float
+    expanded_mm: Annotated[float, Field(ge=0)] | None  # expanded uncertainty (k = 2); None if it is unknown
+    without_interval: str  # reason why the uncertainty is unknown; empty if it is known
+    # Limits of the value; None: not limited.
+    lower_mm: float | None = None
+    upper_mm: float | None = None
+    source: str  # cloud or image that was measured
+    points: int  # number of measured points
+
+    @model_validator(mode="after")
+    def _check_limits(self) -> Self:
+        if self.lower_mm is not None and self.upper_mm is not None and self.lower_mm > self.upper_mm:
+            raise ValueError(
+                f"the lower limit {self.lower_mm:g} mm is above the upper one, {self.upper_mm:g} mm: exchange them"
+            )
+        return self
+
+    @computed_field
+    @property
+    def verdict(self) -> Verdict:
+        """Verdict on the whole interval (ISO 14253-1); undecided if a limit is given and the uncertainty is unknown."""
+        if self.expanded_mm is None:
+            return "no limit" if self.lower_mm is None and self.upper_mm is None else "undecided"
+        low, high = self.value_mm - self.expanded_mm, self.value_mm + self.expanded_mm
+        return judge_interval(low, high, lower=self.lower_mm, upper=self.upper_mm)
+
+    def interval_text(self) -> str:
+        """Return quantity, value and interval as text, or the reason why there is no interval."""
+        known = self.expanded_mm is not None
+        stated = f"± {self._format_figure(self.expanded_mm)} mm" if known else f"mm ({self.without_interval})"
+        return f"{self.quantity} {self._format_figure(self.value_mm)} {stated}"
+
+    def row(self) -> tuple[str, ...]:
+        """Return the texts of a table with `COLUMNS`."""
+        limits = [MISSING if each is None else f"{each:g}" for each in (self.lower_mm, self.upper_mm)]
+        stated = self.without_interval if self.expanded_mm is None else self._format_figure(self.expanded_mm)
+        return self.name, self.quantity, self._format_figure(self.value_mm), stated, *limits, self.verdict, self.source
+
+    def _format_figure(self, value_mm: float | None) -> str:
+        return MISSING if value_mm is None else format_to_scale(value_mm, self.expanded_mm or _SHOWN_MM)
+
+
+class MeasuredValues(Description):
+    """List of measured values. Changes return a new list, which remembers the one before for `undo`.
+
+    ``edited`` is set if its file was edited by hand.
+    """
+
+    model_config = ConfigDict(extra="ignore")
+
+    coverage_factor: float = 2.0  # that of `FigureUncertainty.expanded_mm`
+    values: tuple[MeasuredValue, ...] = ()
+    edited: bool = False
+    before: MeasuredValues | None = Field(default=None, exclude=True, repr=False)
+
+    def add(self, measured: PickedMeasurement, *, source: str, without_interval: str) -> MeasuredValues:
+        """Add all figures of a measurement, named after it and numbered.
+
+        ``without_interval`` is the reason if a figure has no uncertainty.
+        """
+        taken, count = {each.name for each in self.values}, 1
+        while (name := f"{measured.name} {count}") in taken:
+            count += 1
+        first = max((each.number for each in self.values), default=0) + 1
+        added = []
+        for number, (quantity, value) in enumerate(measured.figures_mm.items(), start=first):
+            known = measured.uncertainty.get(quantity)
+            added.append(
+                MeasuredValue(
+                    number=number,
+                    name=name,
+                    quantity=quantity,
+                    value_mm=value,
+                    expanded_mm=None if known is None else known.expanded_mm,
+                    without_interval=without_interval if known is None else "",
+                    source=source,
+                    points=measured.points_used,
+                )
+            )
+        return self.replace((*self.values, *added))
+
+    def rename(self, number: int, name: str) -> MeasuredValues:
+        """Rename a value; DescriptionError if the name is empty or longer than 100 characters."""
+        return self._change(number, name=name.strip())
+
+    def limit(self, number: int, lower_mm: float | None, upper_mm: float | None) -> MeasuredValues:
+        """Set the limits of a value; DescriptionError if the lower one is above the upper one."""
+        return self._change(number, lower_mm=lower_mm, upper_mm=upper_mm)
+
+    def remove(self, number: int) -> MeasuredValues:
+        """Remove a value."""
+        self.find(number)
+        return self.replace([each for each in self.values if each.number != number])
+
+    def undo(self) -> MeasuredValues:
+        """Return the list before the last change; DescriptionError if there was none."""
+        if self.before is None:
+            raise DescriptionError("there is no change of the list to undo")
+        return self.before
+
+    def replace(self, values: Sequence[MeasuredValue]) -> MeasuredValues:
+        """Return a list of other values, which remembers this one."""
+        return MeasuredValues(values=tuple(values), before=self)
+
+    def find(self, number: int) -> MeasuredValue:
+        """Return the value with a number; DescriptionError if it was removed."""
+        found = next((each for each in self.values if each.number == number), None)
+        if found is None:
+            raise DescriptionError(f"value {number} was removed from the list")
+        return found
+
+    def _change(self, number: int, **changed: object) -> MeasuredValues:
+        old = self.find(number)
+        new = validate_description(MeasuredValue, old.model_dump() | changed, f"the value '{old.name}'")
+        return self if new == old else self.replace([new if each is old else each for each in self.values])
+
+    def table(self) -> str:
+        """Return the list as CSV with a line of names; intervals that are unknown are empty."""
+        names = [name for name in MeasuredValue.model_fields if name != "number"]
+        text = io.StringIO()
+        writer = csv.DictWriter(text, [*names, "verdict"], extrasaction="ignore", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(each.model_dump() for each in self.values)
+        return text.getvalue()
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the list as sealed JSON; OutputError if writing fails."""
+        write_model(path, self, file_format=FORMAT, version=VERSION, overwrite=overwrite)
+
+
+def read_measured(path: str | Path) -> MeasuredValues:
+    """Read a list written by `MeasuredValues.save`; CaptureError if it cannot be read."""
+    return read_model(path, MeasuredValues, file_format=FORMAT, version=VERSION, called="list of measured values")

@@ -1,10 +1,4 @@
-"""Stripe centres of an image and of a capture, and their conversion from the numbers of a 3D camera.
-
-A 3D camera detects the stripe itself and outputs one number per profile line, in the pixel format Coord3D_C16 or as
-16-bit images, tables or arrays. The stripe centre is ``scale`` times the number plus ``offset`` (GenICam Standard
-Features Naming Convention 2.7, ``Scan3dCoordinateScale``, ``Scan3dCoordinateOffset``). One number can mean "no stripe"
-(``Scan3dInvalidDataValue``, if ``Scan3dInvalidDataFlag`` is set).
-"""
+"""Stripe centres of an image and of a capture."""
 
 from __future__ import annotations
 
@@ -13,7 +7,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from uwlts.errors import ImageError, RangeError
+from uwlts.errors import RangeError
 
 
 class StripeStatus(IntEnum):
@@ -37,7 +31,7 @@ _OK = np.uint8(StripeStatus.OK)  # NumPy compares with its own integers several 
 
 @dataclass(frozen=True)
 class Stripe:
-    """Stripe centres of one image with L profile lines, or of one profile of a 3D camera.
+    """Stripe centres of one image with L profile lines.
 
     Attributes
     ----------
@@ -84,7 +78,8 @@ class Stripe:
 
     def remove_lines(self, lines: np.ndarray, reason: StripeStatus) -> Stripe:
         """Return the stripe without the centres on lines (M,), whose status becomes ``reason``."""
-        centre, amplitude, width, status = (getattr(self, row).copy() for row in ROWS)
+        columns = self.centre_px, self.amplitude, self.width_px, self.status
+        centre, amplitude, width, status = (column.copy() for column in columns)
         centre[lines], amplitude[lines], width[lines], status[lines] = np.nan, np.nan, np.nan, reason
         return Stripe(centre, amplitude, width, status, self.stripe_along)
 
@@ -144,7 +139,7 @@ class CaptureStripes:
     # (N,) int; image and profile line of each centre.
     frame: np.ndarray
     line: np.ndarray
-    # (N,), float32, float32; as in `Stripe`; amplitude and width are NaN if a 3D camera does not supply them.
+    # (N,), float32, float32; as in `Stripe`.
     centre_px: np.ndarray
     amplitude: np.ndarray
     width_px: np.ndarray
@@ -160,58 +155,3 @@ def stack_pixels(lines: np.ndarray, places_px: np.ndarray, *, stripe_along: str)
     """Return image coordinates (N, 2), u = column and v = row in px, of centres (N,) on profile lines (N,)."""
     order = (places_px, lines) if stripe_along == "height" else (lines, places_px)
     return np.column_stack(order).astype(np.float64)
-
-
-ROWS = ("centre_px", "amplitude", "width_px", "status")
-"""Values of a profile line in this order; only the first is required."""
-
-
-@dataclass(frozen=True)
-class Coordinates:
-    """Conversion of a 3D camera's numbers: ``scale`` and ``offset`` in px, and the number that means "no stripe"."""
-
-    scale: float = 1.0
-    offset: float = 0.0
-    invalid: float | None = None
-
-    def stripe(self, numbers: np.ndarray, *, stripe_along: str, length_px: int) -> Stripe:
-        """Convert a profile (L,), or up to four rows (K, L) in the order of `ROWS`, to a stripe.
-
-        NaN also means "no stripe". Amplitude and width are NaN if they are not given. ``length_px`` is the number of
-        pixels of a profile line.
-
-        Raises
-        ------
-        ImageError
-            A centre is outside its line, a status is unknown, or the array has another shape.
-        """
-        rows = np.atleast_2d(np.asarray(numbers, float))
-        if rows.ndim != 2 or len(rows) > len(ROWS):
-            raise ImageError(f"a centre line has the shape {numbers.shape}; expected (L,), or up to 4 rows of L")
-        valid = np.isfinite(rows[0])
-        if self.invalid is not None:
-            valid &= rows[0] != self.invalid
-        status = np.where(valid, StripeStatus.OK, StripeStatus.NO_STRIPE)
-        if len(rows) == len(ROWS):
-            if not np.isin(rows[3], list(StripeStatus)).all():
-                raise ImageError(f"a centre line has statuses other than 0 to {max(StripeStatus):d}: {rows[3]}")
-            status = np.where(valid | (rows[3] != StripeStatus.OK), rows[3], StripeStatus.NO_STRIPE)
-        good = status == StripeStatus.OK
-        centre = np.where(good, self.scale * rows[0] + self.offset, np.nan)
-        if good.any() and not -0.5 <= np.nanmin(centre) <= np.nanmax(centre) <= length_px - 0.5:
-            raise ImageError(
-                f"the centres range from {np.nanmin(centre):g} to {np.nanmax(centre):g} px, the profile lines from "
-                f"0 to {length_px - 1} px: check scale ({self.scale:g}), offset ({self.offset:g}) and the number for "
-                f"no stripe ({self.invalid})"
-            )
-        amplitude, width = (
-            np.where(good, rows[k], np.nan) if len(rows) > k else np.full(len(centre), np.nan) for k in (1, 2)
-        )
-        return Stripe(
-            centre, amplitude.astype(np.float32), width.astype(np.float32), status.astype(np.uint8), stripe_along
-        )
-
-
-def stack_rows(stripe: Stripe) -> np.ndarray:
-    """Return the values of a stripe's lines as an array (4, L) in the order of `ROWS`."""
-    return np.stack([getattr(stripe, row) for row in ROWS]).astype(float)

@@ -118,8 +118,8 @@ class IlluminatedPoints:
 
         The sheet's thickness is the described one, limited by the median stripe width.
 
-        ``width_px`` (N,) is the full width at half maximum, NaN where unknown; ``slopes`` (N,) are those of
-        `fit_brightness_slopes`; the direction is as the capture describes it.
+        ``width_px`` (N,) is the full width at half maximum; ``slopes`` (N,) are those of `fit_brightness_slopes`; the
+        direction is as the capture describes it.
         """
         direction = np.array(self.calibration.stage_direction_of(stage_direction))
         across = float(
@@ -127,8 +127,7 @@ class IlluminatedPoints:
         )
         if abs(across) < _LEAST_ACROSS or not slopes.any():
             return np.zeros((len(slopes), 3))
-        known = width_px[np.isfinite(width_px)]
-        widest = (np.median(known) if len(known) else np.inf) / FWHM_PER_SIGMA
+        widest = np.median(width_px) / FWHM_PER_SIGMA
         return self.of_slope * (slopes / across * np.minimum(1.0, (widest / self.per_sigma_px) ** 2))[:, None]
 
     def footprint_mm(self, width_px: np.ndarray) -> tuple[float, float]:
@@ -143,9 +142,9 @@ class IlluminatedPoints:
         position u. A surface height h(u) changes the image by -S' h, and the centroid by the integral of
         -u S' h = (u / s)^2 S h. These weights of h have the variance 3 s^2, whereas the light has s^2.
 
-        ``width_px`` (N,) is the full width of each stripe at half maximum; NaN where unknown.
+        ``width_px`` (N,) is the full width of each stripe at half maximum.
         """
-        chosen = np.flatnonzero(np.isfinite(width_px) & (self.found.status == RayStatus.OK))
+        chosen = np.flatnonzero(self.found.status == RayStatus.OK)
         chosen = chosen[:: max(1, len(chosen) // _MOST_FOR_FOOTPRINT)]
         line, place = self.line[chosen], self.centre_px[chosen]
         # Neighbouring lines must stay within the table.
@@ -191,11 +190,9 @@ def fit_brightness_slopes(
     """Return the slopes (N,) of the log stripe amplitude per mm of stage travel, 0 where they are unknown.
 
     Each slope belongs to a plane fitted to the log amplitudes of neighbouring lines and images. The fit averages noise
-    and speckle. All slopes are 0 if an amplitude is not finite, because the 3D camera does not supply it. Images are at
-    stage positions (F,) in any order. If one of their exposures (F,) is unknown (0), all are assumed equal.
+    and speckle. Images are at stage positions (F,) in any order. If one of their exposures (F,) is unknown (0), all are
+    assumed equal.
     """
-    if not np.isfinite(amplitude).all():
-        return np.zeros(len(frame))
     there = np.bincount(frame, minlength=len(stage_mm)) > 0
     order = np.argsort(stage_mm, kind="stable")
     order = order[there[order]]
@@ -258,14 +255,9 @@ def estimate_blur_shift_px(
 
 
 def select_sharp_lines(stripes: CaptureStripes) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indices (M,) of stripe centres that blur shifts by less than 0.1 px, and their largest shifts, px.
-
-    If an amplitude or width is not finite, because the 3D camera does not supply it, return all centres with shift 0.
-    """
+    """Return the indices (M,) of stripe centres that blur shifts by less than 0.1 px, and their largest shifts, px."""
     if len(stripes.line) == 0:
         return np.empty(0, np.intp), np.empty(0)
-    if not (np.isfinite(stripes.amplitude).all() and np.isfinite(stripes.width_px).all()):
-        return np.arange(len(stripes.line)), np.zeros(len(stripes.line))
     moved = estimate_blur_shift_px(stripes.frame, stripes.line, stripes.centre_px, stripes.amplitude, stripes.width_px)
     sharp = np.flatnonzero(np.abs(moved) < _MOST_BLUR_PX)
     return sharp, moved[sharp]

@@ -317,8 +317,8 @@ def reconstruct_by_polynomials(
     # Lines without a range have NaN limits; comparisons with NaN are false.
     known &= (centres_px >= domains[rows, 0]) & (centres_px <= domains[rows, 1])
     rows = rows[known]
-    depth = _polynomial_values(calibration.depth_coefficients, rows, centres_px[known], calibration.position_range_px)
-    along = _polynomial_values(calibration.along_coefficients, rows, depth, calibration.depth_range_mm)
+    depth = _evaluate(calibration.depth_coefficients, rows, centres_px[known], calibration.position_range_px)
+    along = _evaluate(calibration.along_coefficients, rows, depth, calibration.depth_range_mm)
     points = np.full((len(lines), 3), np.nan)
     points[known] = np.column_stack([np.zeros(len(rows)), along, depth])
     points += stage_travel(stage_mm, stage_direction).T
@@ -326,7 +326,7 @@ def reconstruct_by_polynomials(
     return MeasuredPoints(points, status)
 
 
-def _polynomial_values(
+def _evaluate(
     coefficients: tuple[tuple[float, ...], ...], rows: np.ndarray, x: np.ndarray, limits: tuple[float, float]
 ) -> np.ndarray:
     """Evaluate the polynomials in ``rows`` (N,) at x (N,)."""

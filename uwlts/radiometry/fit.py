@@ -122,8 +122,8 @@ def fit_radiometry(
     Raises
     ------
     CaptureError, CalibrationError
-        A file cannot be read; calibration and capture do not fit; the capture has free poses, centre lines instead of
-        images, images at too few positions, or too few stripe centres.
+        A file cannot be read; calibration and capture do not fit; the capture has free poses, images at too
+        few positions, or too few stripe centres.
     DescriptionError
         The reflectance is not above 0 and up to 1.
 

@@ -99,7 +99,7 @@ def _open_data_set(folder: Path, stripe: StripeSettings) -> ImageSet:
 def _open_capture(path: Path, stripe: StripeSettings) -> ImageSet:
     with Capture(path) as capture:
         header = capture.header
-        lit = np.flatnonzero(capture.laser_on & capture.has_image).tolist()
+        lit = np.flatnonzero(capture.laser_on).tolist()
     if not lit:
         raise CaptureError(f"{path} has no laser image; statistics of the stripe need images")
 

@@ -8,6 +8,13 @@ import numpy as np
 from pydantic import JsonValue, PlainSerializer
 
 from uwlts._version import __version__
+from uwlts.calibration.joint.calibrated_volume import (
+    CalibrationInUse,
+    LengthUncertainty,
+    index_key,
+    length_uncertainties,
+    prepare_use,
+)
 from uwlts.calibration.joint.next_shot import WHOLE_VOLUME, rank_next_shots
 from uwlts.calibration.joint.observability import (
     Weakness,
@@ -26,13 +33,6 @@ from uwlts.model.joint_estimate import ImageFit
 from uwlts.model.parameter_keys import ParameterKey, WindowParameter, parse_parameter
 from uwlts.model.sensor import Description, Medium
 from uwlts.pages.toolkit import MISSING, format_to_scale
-from uwlts.report.certificate_volume import (
-    CalibrationInUse,
-    LengthUncertainty,
-    index_key,
-    length_uncertainties,
-    prepare_use,
-)
 
 
 class ParameterRow(Description):
@@ -49,7 +49,7 @@ class ParameterRow(Description):
         """Return value and standard uncertainty as text, rounded to two digits of the uncertainty."""
         if self.std is None or not self.std > 0:
             return f"{self.value:.6g}", MISSING
-        return format_to_scale(self.value, self.std, digits=2), format_to_scale(self.std, self.std, digits=2)
+        return format_to_scale(self.value, self.std), format_to_scale(self.std, self.std)
 
 
 def parameter_rows(calibration: Calibration) -> tuple[ParameterRow, ...]:

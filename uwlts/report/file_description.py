@@ -26,7 +26,6 @@ from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import CLOUD_ENDINGS, is_readable_cloud, read_cloud
 from uwlts.storage.figure_table import FORMAT as FIGURES, FigureTable, read_figures
 from uwlts.storage.hdf5_file import read_format
-from uwlts.storage.mesh_file import READ_FORMATS as MESH_FORMATS, SurfaceMesh, has_faces, read_mesh
 from uwlts.storage.mount_files import read_mount
 from uwlts.storage.number_tables import Unit
 from uwlts.storage.pose_files import SAVED_FORMAT, PoseFormat, holds_trajectory, read_trajectory
@@ -34,7 +33,7 @@ from uwlts.storage.truth import FORMAT as TRUTH, Truth, TruthHeader, TruthStatus
 
 _TABLES = (".csv", ".txt", ".asc")  # endings of text with a cloud or a trajectory
 _Stored = AnyCalibration | Mount | Evaluation | FigureTable
-_Readable = Capture | PointCloud | SurfaceMesh | Truth | Trajectory | _Stored
+_Readable = Capture | PointCloud | Truth | Trajectory | _Stored
 _JSON_READERS: dict[str, Callable[[Path], _Stored]] = {
     CALIBRATION: load_calibration,
     POLYNOMIALS_FORMAT: load_calibration,
@@ -43,7 +42,7 @@ _JSON_READERS: dict[str, Callable[[Path], _Stored]] = {
     FIGURES: read_figures,
 }
 _READABLE = (
-    f"captures and ground truth (.h5), clouds ({', '.join(CLOUD_ENDINGS)}), meshes ({', '.join(MESH_FORMATS)}), "
+    f"captures and ground truth (.h5), clouds ({', '.join(CLOUD_ENDINGS)}), "
     "calibrations, mounts, figures and evaluations (.json), trajectories (.csv, .tum, ROS bags)"
 )
 
@@ -53,10 +52,9 @@ def read(
 ) -> _Readable:
     """Read a file of the program, whose content determines the type of the result.
 
-    The result is of the class that was saved, or an opened capture. A PLY file with faces is a mesh, text with times
-    and rotations a trajectory. The metadata of a capture's frames are read at once, and images on demand:
-    ``capture[12]`` is a `Frame`. A recording in progress can be opened by its name ``NAME.part``. Close a capture, or
-    use it as a context manager.
+    The result is of the class that was saved, or an opened capture. Text with times and rotations is a trajectory.
+    The metadata of a capture's frames are read at once, and images on demand: ``capture[12]`` is a `Frame`. A recording
+    in progress can be opened by its name ``NAME.part``. Close a capture, or use it as a context manager.
 
     Parameters
     ----------
@@ -71,7 +69,7 @@ def read(
 
     Returns
     -------
-    Capture, PointCloud, SurfaceMesh, Truth, Mount, Evaluation, FigureTable, Trajectory or a calibration
+    Capture, PointCloud, Truth, Mount, Evaluation, FigureTable, Trajectory or a calibration
         An opened capture must be closed, or used in a ``with`` statement.
 
     Raises
@@ -100,8 +98,6 @@ def read(
         return reader(path)
     if ending.lower() in _TABLES and (pose_format != SAVED_FORMAT or holds_trajectory(path)):
         return read_trajectory(path, pose_format=pose_format, unit=pose_unit)
-    if ending.lower() in MESH_FORMATS and (ending.lower() != ".ply" or has_faces(path)):
-        return read_mesh(path, unit=unit)
     if is_readable_cloud(path):
         return read_cloud(path, unit=unit)
     if ending == ".h5":
@@ -193,8 +189,6 @@ def _describe_content(found: object) -> list[str]:
             return cloud_lines(found)
         case Trajectory():
             return trajectory_lines(found)
-        case SurfaceMesh():
-            return found.lines()
         case _:
             return repr(found).splitlines()
 
@@ -205,9 +199,8 @@ def capture_lines(capture: Capture) -> list[str]:
     laser = int(capture.laser_on.sum())
     lines = [
         f"capture of the sensor '{header.sensor.name}' in {header.medium_name} "
-        f"({_medium(header.medium, header.sensor)})",
+        f"({_describe(header.medium, header.sensor)})",
         f"{len(capture)} frames of {camera.width_px} x {camera.height_px} pixels, {laser} with the laser on"
-        + (f", {lines_only} of them centre lines" if (lines_only := int((~capture.has_image).sum())) else "")
         + ("" if capture.finished else "; the recording was interrupted"),
     ]
     if len(capture):
@@ -228,7 +221,7 @@ def truth_lines(header: TruthHeader, truth: Truth) -> list[str]:
     frames, lines = truth.status.shape
     visible = int(np.count_nonzero(truth.status == TruthStatus.VISIBLE))
     return [
-        f"ground truth of the sensor '{header.sensor.name}' ({_medium(header.medium, header.sensor)})",
+        f"ground truth of the sensor '{header.sensor.name}' ({_describe(header.medium, header.sensor)})",
         f"{frames} frames of {lines} profile lines, {visible} of them show the stripe",
     ]
 
@@ -369,12 +362,12 @@ def mount_lines(mount: Mount) -> list[str]:
     found = mount.artefact
     if isinstance(found, BoardFound):
         x, y, z = (row[3] for row in found.T_base_target[:3])
-        lines.append(f"target, mm                origin at {_vector((x, y, z))}")
+        lines.append(f"target, mm                origin at {_format((x, y, z))}")
     elif isinstance(found, SphereFound):
         known = within(found.radius_std_mm)
-        lines.append(f"sphere, mm                at {_vector(found.centre_mm)}, radius {found.radius_mm:.3f} ({known})")
+        lines.append(f"sphere, mm                at {_format(found.centre_mm)}, radius {found.radius_mm:.3f} ({known})")
     else:
-        lines.append(f"plane                     normal {_vector(found.normal)}, distance {found.distance_mm:.3f} mm")
+        lines.append(f"plane                     normal {_format(found.normal)}, distance {found.distance_mm:.3f} mm")
     if mount.robot_scale is not None and mount.robot_scale_std is not None:
         half_scale = mount.coverage_factor * mount.robot_scale_std
         lines.append(f"robot's scale             {mount.robot_scale:.6f} +-{half_scale:.6f}")
@@ -395,7 +388,7 @@ def mount_lines(mount: Mount) -> list[str]:
     return lines
 
 
-def _vector(values: tuple[float, float, float]) -> str:
+def _format(values: tuple[float, float, float]) -> str:
     return f"({', '.join(f'{value:.3f}' for value in values)})"
 
 
@@ -453,7 +446,7 @@ def sensor_lines(sensor: Sensor) -> list[str]:
     for name, medium in sensor.media.items():
         view = check_design(sensor, medium)
         lines.append(
-            f"{name} ({_medium(medium, sensor)}): stand-off {view.standoff_mm:.1f} mm outside the window, sheet in "
+            f"{name} ({_describe(medium, sensor)}): stand-off {view.standoff_mm:.1f} mm outside the window, sheet in "
             f"view from {view.nearest_mm:.1f} to {view.farthest_mm:.1f} mm"
         )
         for along, side in (("width", sensor.camera.width_px), ("height", sensor.camera.height_px)):
@@ -465,7 +458,7 @@ def sensor_lines(sensor: Sensor) -> list[str]:
     return lines
 
 
-def _medium(medium: Medium, sensor: Sensor) -> str:
+def _describe(medium: Medium, sensor: Sensor) -> str:
     index = medium.refractive_index(sensor.laser.wavelength_nm)
     water = f", {medium.temperature_c:g} degC, {medium.salinity_g_kg:g} g/kg" if medium.kind in ("fresh", "sea") else ""
     return f"{medium.kind}, n {index:.5f}{water}"

@@ -13,11 +13,11 @@ import numpy as np
 from matplotlib.colors import ListedColormap
 
 from uwlts._version import __version__
-from uwlts.errors import EvaluationError
+from uwlts.errors import DescriptionError, EvaluationError
 from uwlts.evaluation.evaluate import read_evaluation
-from uwlts.evaluation.figures import VERDICTS, Figure
+from uwlts.evaluation.figures import Figure
 from uwlts.files.json_files import EDITED, json_text
-from uwlts.files.writing import hash_file
+from uwlts.files.writing import hash_file, refuse_unsuitable, write_file
 from uwlts.inspection.features import (
     BLEMISHES,
     COVERAGE,
@@ -28,7 +28,17 @@ from uwlts.inspection.features import (
     FeatureValue,
     Inspection,
 )
+from uwlts.inspection.findings_order import (
+    VERDICTS,
+    FindingOrder,
+    format_place,
+    judge_feature,
+    load_order,
+    resolve_datum,
+    sort_by_severity,
+)
 from uwlts.inspection.inspect import InspectionKind, inspect_cloud
+from uwlts.inspection.picking import COLUMNS, MEASURED_ENDINGS, MeasuredValues, read_measured
 from uwlts.model.calibration import calibration_digest
 from uwlts.model.sensor import Table
 from uwlts.pages.toolkit import (
@@ -44,17 +54,6 @@ from uwlts.pages.toolkit import (
     write_page,
 )
 from uwlts.report.certificate import check_certificate
-from uwlts.report.measured_values import (
-    COLUMNS,
-    FindingOrder,
-    MeasuredValues,
-    format_place,
-    judge_feature,
-    load_order,
-    read_measured,
-    resolve_datum,
-    sort_by_severity,
-)
 from uwlts.report.plot import DEVIATIONS, surface_limit_mm
 from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.cloud import PointCloud, compute_normal_std
@@ -204,6 +203,25 @@ def write_findings(
     return found
 
 
+def write_measured(page: str | Path, measured: MeasuredValues, *, title: str, overwrite: bool = False) -> list[Path]:
+    """Write values measured by hand as a page NAME.measured.html, and beside it as JSON and CSV; return the paths.
+
+    Raises DescriptionError if the list is empty; OutputError if a file exists and ``overwrite`` is not set, or cannot
+    be written.
+    """
+    if not measured.values:
+        raise DescriptionError("the list of measured values is empty: measure something first")
+    paths = [Path(page).with_suffix(Path(each).suffix) for each in MEASURED_ENDINGS]
+    for path, ending in zip(paths, MEASURED_ENDINGS, strict=True):
+        refuse_unsuitable(path, overwrite=overwrite, endings=(ending,))
+    rows = [each.row() for each in measured.values]
+    text = render_page("uwlts.report", "measured.html.j2", title=title, columns=COLUMNS, rows=rows)
+    measured.save(paths[1], overwrite=overwrite)
+    write_file(paths[2], measured.table(), overwrite=overwrite)
+    write_page(paths[0], text, overwrite=overwrite)
+    return paths
+
+
 def _list_sources(
     path: Path,
     cloud: PointCloud,
@@ -253,8 +271,8 @@ def _check_row(figure: Figure) -> tuple[str, ...]:
     expanded = figure.expanded_uncertainty_mm
     fine = expanded or _SMALLEST_MM
     calibrated = MISSING if figure.calibrated_mm is None else f"{figure.calibrated_mm:g}"
-    stated = MISSING if expanded is None else format_to_scale(expanded, fine, digits=2)
-    return figure.key.name.replace("_", " "), calibrated, format_to_scale(figure.value_mm, fine, digits=2), stated
+    stated = MISSING if expanded is None else format_to_scale(expanded, fine)
+    return figure.key.name.replace("_", " "), calibrated, format_to_scale(figure.value_mm, fine), stated
 
 
 def _render(
@@ -297,7 +315,7 @@ def _render(
         by_hand=None if by_hand is None else (COLUMNS, [each.row() for each in by_hand.values]),
         maps=_make_maps(found, cloud, parts, order),
         accuracy=_state_point_accuracy(cloud),
-        depths=[format_to_scale(each, each, digits=2) for each in dict.fromkeys((*depths[:1], *depths[-1:]))],
+        depths=[format_to_scale(each, each) for each in dict.fromkeys((*depths[:1], *depths[-1:]))],
         pictures=[
             (each.title, judge_feature(each, order.limits)[0], _plot_finding(each, found, cloud)) for each in drawn
         ],
@@ -360,24 +378,19 @@ def format_interval(value: FeatureValue) -> str:
     half = COVERAGE_FACTOR * value.uncertainty
     if value.bound:
         text, number = value.bound
-        return f"{text} {format_to_scale(number, max(half, _SMALLEST_MM), digits=2)}"
+        return f"{text} {format_to_scale(number, max(half, _SMALLEST_MM))}"
     if half <= _SMALLEST:
         return f"{value.value:.4g}"
-    shown = format_to_scale(value.value, half, digits=2)
+    shown = format_to_scale(value.value, half)
     if value.low > value.value - 0.9 * half:
         # The interval of a non-negative value is asymmetric.
-        return (
-            f"{shown} ({format_to_scale(value.low, half, digits=2)} to {format_to_scale(value.high, half, digits=2)})"
-        )
-    return f"{shown} ± {format_to_scale(half, half, digits=2)}"
+        return f"{shown} ({format_to_scale(value.low, half)} to {format_to_scale(value.high, half)})"
+    return f"{shown} ± {format_to_scale(half, half)}"
 
 
 def _make_value_row(value: FeatureValue) -> tuple[str, ...]:
     parts = value.random, value.systematic
-    fine = [
-        MISSING if part is None else format_to_scale(part, part, digits=2) if part > _SMALLEST else "0"
-        for part in parts
-    ]
+    fine = [MISSING if part is None else format_to_scale(part, part) if part > _SMALLEST else "0" for part in parts]
     return value.name, value.unit, format_interval(value), *fine
 
 
@@ -404,8 +417,8 @@ def _make_maps(
     pipe = next((each for each in found.features if each.kind == FeatureKind.PIPE), None)
     labels = ["X / mm", "Y / mm"] if pipe is None else ["along the axis / mm", "around the circumference / mm"]
     middle = cloud.points_mm.mean(axis=0)
-    at = _map_coordinates(cloud.points_mm, pipe, middle)
-    marks = _map_coordinates(np.array([each.place_mm for each in parts]).reshape(-1, 3), pipe, middle)
+    at = _compute_map_coordinates(cloud.points_mm, pipe, middle)
+    marks = _compute_map_coordinates(np.array([each.place_mm for each in parts]).reshape(-1, 3), pipe, middle)
     ends = [(side.min(), side.max()) for side in at]
     if pipe:
         ends[1] = -np.pi * pipe["diameter"].value / 2, np.pi * pipe["diameter"].value / 2
@@ -422,7 +435,7 @@ def _make_maps(
     height = 7.2 * float(np.ptp(at[1]) / max(np.ptp(at[0]), 1e-9))
     figure, (axes,) = new_figure(8.0, height + 1.5)
     size = float(np.clip(1.5 * height * 7.2 * 72**2 / max(len(shown), 1), 1, 60))
-    colours = axes.scatter(*at[:, shown], c=found.deviation_mm[shown], rasterized=True, s=size, **_colour_scale(found))
+    colours = axes.scatter(*at[:, shown], c=found.deviation_mm[shown], rasterized=True, s=size, **_scale_colour(found))
     figure.colorbar(colours, ax=axes, label="above the undamaged surface / mm", orientation="horizontal", aspect=50)
     for each, place in zip(parts, marks.T, strict=True):
         colour = _VERDICT_COLOURS[judge_feature(each, order.limits)[0]]
@@ -446,7 +459,7 @@ def _make_maps(
     return png_data_uri(figure, dpi=130), png_data_uri(seen, dpi=110), said
 
 
-def _colour_scale(found: Inspection) -> dict[str, Any]:
+def _scale_colour(found: Inspection) -> dict[str, Any]:
     """Return the one scale of the map and of all pictures of findings."""
     limit = surface_limit_mm(found.deviation_mm)
     return {"cmap": DEVIATIONS, "vmin": -limit, "vmax": limit, "linewidths": 0}
@@ -462,10 +475,10 @@ def _state_point_accuracy(cloud: PointCloud) -> list[str] | None:
         return None
     every = COVERAGE_FACTOR * np.hypot(random, common)
     typical = [float(np.median(each)) for each in (every, COVERAGE_FACTOR * random, COVERAGE_FACTOR * common)]
-    return [format_to_scale(each, typical[0], digits=2) for each in (*typical, float(np.quantile(every, COVERAGE)))]
+    return [format_to_scale(each, typical[0]) for each in (*typical, float(np.quantile(every, COVERAGE)))]
 
 
-def _map_coordinates(points: np.ndarray, pipe: Feature | None, middle: np.ndarray) -> np.ndarray:
+def _compute_map_coordinates(points: np.ndarray, pipe: Feature | None, middle: np.ndarray) -> np.ndarray:
     """Return map coordinates (2, N) of points: along and around a pipe, centred at ``middle`` (3,), else X and Y."""
     if pipe is None:
         return points[:, :2].T
@@ -485,7 +498,7 @@ def _plot_finding(feature: Feature, found: Inspection, cloud: PointCloud) -> str
     local, deviation = local[near], found.deviation_mm[near]
     figure, (above, cut) = new_figure(7.4, 2.4, columns=2)
     size = float(np.clip(25_000 / max(len(local), 1), 2, 40))
-    colours = above.scatter(local[:, 0], local[:, 1], c=deviation, s=size, **_colour_scale(found))
+    colours = above.scatter(local[:, 0], local[:, 1], c=deviation, s=size, **_scale_colour(found))
     figure.colorbar(colours, ax=above, label="deviation / mm")
     for other in found.select(*BLEMISHES):
         outline = (other.outline_mm - feature.place_mm) @ feature.axes.T

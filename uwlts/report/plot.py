@@ -17,7 +17,7 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D, proj3d
 
 from uwlts.argument_types import check_arguments
-from uwlts.errors import ImageError
+from uwlts.errors import CalibrationError, ImageError
 from uwlts.files.json_files import number_list
 from uwlts.model.calibration import Calibration
 from uwlts.pages.cloud_figure import AZIMUTH_DEG, ELEVATION_DEG, STOPS, CloudField, scale_values, view_direction
@@ -62,10 +62,6 @@ _AROUND_PX = 24
 _LINES_ENLARGED = 44
 # Margin on either side of a stripe in the enlarged part, px.
 _AROUND_ENLARGED_PX = 7
-
-
-class NothingToDrawError(ValueError):
-    """A cloud or calibration does not contain the data of a plot."""
 
 
 @check_arguments
@@ -208,11 +204,7 @@ def _choose_lines(stripe: Stripe, *, enlarged: bool) -> np.ndarray:
     if not enlarged:
         return stripe.lines
     count = min(_LINES_ENLARGED, len(stripe.lines))
-    # Without amplitudes of a 3D camera, show the part with the most lines.
-    amplitude = (
-        stripe.amplitude if np.isfinite(stripe.amplitude).any() else np.where(np.isfinite(stripe.centre_px), 1, 0)
-    )
-    first = int(np.argmax(np.convolve(np.nan_to_num(amplitude), np.ones(count), mode="valid")))
+    first = int(np.argmax(np.convolve(np.nan_to_num(stripe.amplitude), np.ones(count), mode="valid")))
     return stripe.lines[(stripe.lines >= first) & (stripe.lines < first + count)]
 
 
@@ -231,7 +223,7 @@ def residuals(calibration: Calibration, ax: Axes | None = None, *, which: str | 
 
     Raises
     ------
-    NothingToDrawError
+    CalibrationError
         The calibration does not contain this list, or none.
     """
     lists = {
@@ -240,10 +232,10 @@ def residuals(calibration: Calibration, ax: Axes | None = None, *, which: str | 
         if len(values := number_list(value) or ()) > _SHORT_LIST and any(each is not None for each in values)
     }
     if which is None and not lists:
-        raise NothingToDrawError("the calibration stores no list of residuals")
+        raise CalibrationError("the calibration stores no list of residuals")
     which = which or next(iter(lists))
     if which not in lists:
-        raise NothingToDrawError(f"the calibration stores no list of residuals {which}; it has {', '.join(lists)}")
+        raise CalibrationError(f"the calibration stores no list of residuals {which}; it has {', '.join(lists)}")
     (group, _, name), values = which.rpartition("."), lists[which]
     stored = calibration.figures(group).get("images")
     images = [image for image in stored if isinstance(image, str)] if isinstance(stored, list) else []

@@ -5,13 +5,8 @@ checksum) and, per frame, ``stage_mm``, ``pose`` (4, 4), ``laser_on``, ``exposur
 ``pose_covariance`` (6, 6). Its attributes are ``format``, ``version`` and ``header``: JSON with sensor, medium, target,
 artefact and provenance. Nothing in the file is ever executed, and real and synthetic captures have the same structure.
 
-The frames of a 3D camera, which extracts the stripe itself, are centre lines (version 2). ``centre_lines (N, 4, L)``
-has the rows centre, amplitude, width and status of a `Stripe`. ``has_image (N,)`` marks frames that are images, such as
-those of a target. ``encoder (N,)`` is the encoder count of each frame, or NaN. Parts of ``frames`` or ``centre_lines``
-that a frame does not use take no space.
-
-A capture of a moving stage has ``speed_mm_per_s (N,)`` (also version 2), positive for growing positions, and the
-stage's reports during the motion: ``stage_reports (M, 2)`` with time in s on the frames' clock and position in mm.
+A capture of a moving stage (version 2) has ``speed_mm_per_s (N,)``, positive for growing positions, and the stage's
+reports during the motion: ``stage_reports (M, 2)`` with time in s on the frames' clock and position in mm.
 
 During recording the file is called ``NAME.part`` and every frame is flushed in HDF5's single-writer mode, so that an
 interrupted recording keeps all its complete frames. Closing the file renames it.
@@ -29,12 +24,11 @@ import hdf5plugin  # noqa: F401, gives HDF5 the filter by which frames are read
 import numpy as np
 
 from uwlts.argument_types import check_arguments
-from uwlts.errors import CaptureError, ImageError
+from uwlts.errors import CaptureError
 from uwlts.files.reading import require_regular_file
 from uwlts.files.writing import hash_file
 from uwlts.model.joint_estimate import CaptureSource
-from uwlts.model.sensor import Camera, CaptureHeader, Table, is_rigid
-from uwlts.model.stripe import ROWS, Stripe, StripeStatus
+from uwlts.model.sensor import CaptureHeader, Table, is_rigid
 from uwlts.storage.hdf5_file import (
     DAMAGE,
     find_dataset,
@@ -48,62 +42,36 @@ from uwlts.storage.hdf5_file import (
 
 FORMAT = "uwlts-capture"
 VERSION = 2
-"""Version of captures with centre lines or a moving stage; captures of images at rest have version 1."""
+"""Version of captures of a moving stage; captures at rest have version 1."""
 PER_FRAME: dict[str, tuple[tuple[int, ...], type]] = {"stage_mm": ((), float), "pose": ((4, 4), float)}
 PER_FRAME |= {"laser_on": ((), bool), "exposure_ms": ((), float), "time_s": ((), float)}
 """Columns of every capture, with the shape and the type of one frame's value."""
 COVARIANCE = "pose_covariance"
-MORE: dict[str, tuple[tuple[int, ...], type]] = {"has_image": ((), bool)} | dict.fromkeys(
-    ("encoder", "speed_mm_per_s"), ((), float)
-)
-"""Columns of version 2."""
+SPEED = "speed_mm_per_s"
+"""Column of a moving stage."""
 POSE_ROUNDED = 1e-4
 """Largest deviation of a pose's elements from a rotation, for tables with four or more decimals."""
-
-Seen = np.ndarray | Stripe
-"""Content of a frame: an image (H, W) of uint8 or uint16, or the stripe extracted by a 3D camera."""
-
-
-def require_image(seen: Seen, called: str) -> np.ndarray:
-    """Return an image (H, W) unchanged; raises ImageError for a centre line."""
-    if isinstance(seen, Stripe):
-        raise ImageError(
-            f"{called} is a centre line from a 3D camera where an image is needed: take images with its pixel "
-            "format Mono8 for targets and exposures"
-        )
-    return seen
-
-
-def drawable_image(seen: Seen, camera: Camera) -> np.ndarray:
-    """Return an image (H, W) to draw on; it is black for a centre line."""
-    return np.zeros((camera.height_px, camera.width_px), np.uint8) if isinstance(seen, Stripe) else seen
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame with its stage position, light, exposure, time, and pose ``T_scene_object`` (4, 4) if known.
+    """An image (H, W) of uint8 or uint16 with stage position, light, exposure, time, and pose if known.
 
-    ``pose_covariance`` (6, 6) is that of the shift in mm, then of a further rotation in rad about the scene's axes, if
-    known. If the capture states a mount, the pose is that of the platform. ``encoder`` is the encoder count, if any.
+    ``pose`` (4, 4) is ``T_scene_object``, or that of the platform if the capture states a mount. ``pose_covariance``
+    (6, 6) is that of the shift in mm, then of a further rotation in rad about the scene's axes, if known.
 
     For a moving stage, position and time are those at the middle of the exposure; with a rolling shutter, of the
     image's middle row.
     """
 
-    seen: Seen
+    image: np.ndarray
     stage_mm: float
     laser_on: bool
     exposure_ms: float
     time_s: float
     pose: np.ndarray | None = None
-    encoder: float | None = None
     speed_mm_per_s: float = 0.0
     pose_covariance: np.ndarray | None = None
-
-    @property
-    def image(self) -> np.ndarray:
-        """The image (H, W); raises ImageError if the frame is a centre line."""
-        return require_image(self.seen, f"the frame at {self.time_s:g} s")
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,10 +154,6 @@ class Capture(AbstractContextManager["Capture"]):
         the platform, ``T_scene_platform``, if the header states ``T_platform_sensor``.
     pose_covariance : (N, 6, 6) float64 or None
         Covariance of each pose (`Frame`), all NaN if unknown; None in captures without any.
-    has_image : (N,) bool
-        Whether a frame is an image, rather than a centre line.
-    encoder : (N,) float64
-        Encoder count at each frame; NaN without an encoder.
     speed_mm_per_s : (N,) float64
         Speed of the stage at each frame, positive for growing positions; 0 at rest.
     stage_reports : (M, 2) float64
@@ -198,7 +162,8 @@ class Capture(AbstractContextManager["Capture"]):
     Raises
     ------
     CaptureError
-        The file is missing, foreign, truncated, of a newer version, or contradicts itself.
+        The file is missing, foreign, truncated, of a newer version, or contradicts itself; or it has centre lines of a
+        3D camera, which versions before 0.3 recorded.
     """
 
     @check_arguments
@@ -221,30 +186,27 @@ class Capture(AbstractContextManager["Capture"]):
             raise
 
     def _read_frames(self, *, unfinished: bool) -> None:
+        if "centre_lines" in self.file:
+            raise CaptureError(
+                f"{self.path} has centre lines of a 3D camera, expected images only: read it with uwlts 0.2, or record "
+                "images with the camera's pixel format Mono8"
+            )
         camera = self.header.sensor.camera
         images = self._open_dataset("frames", (camera.height_px, camera.width_px), "u")
         if images.chunks != (1, *images.shape[1:]) or images.dtype.itemsize > 2:
             raise CaptureError(f"{self.path} is damaged: frames are {images.dtype} in chunks of {images.chunks}")
-        held = PER_FRAME | {name: each for name, each in MORE.items() if name in self.file}
+        held = PER_FRAME | ({SPEED: ((), float)} if SPEED in self.file else {})
         columns = {name: self._open_column(name, shape, np.dtype(kind).kind) for name, (shape, kind) in held.items()}
         self._images, self.dtype = images, images.dtype.newbyteorder("=")
-        self.holds_lines = "centre_lines" in self.file
         self.moving = "stage_reports" in self.file
         self._count = min(map(len, (images, *columns.values())))
-        if self.holds_lines:
-            self._lines = self._open_dataset("centre_lines", (len(ROWS), camera.lines()), "f")
-            if self._lines.chunks != (1, *self._lines.shape[1:]):
-                raise CaptureError(f"{self.path} is damaged: centre lines are in chunks of {self._lines.chunks}")
-            self._count = min(self._count, len(self._lines))
-        self.has_image, self.encoder, self.speed_mm_per_s = (
-            read_values(columns[name], slice(self._count)) if name in columns else np.full(self._count, usual)
-            for name, usual in zip(MORE, (True, np.nan, 0.0), strict=True)
-        )
+        speed = columns.get(SPEED)
+        self.speed_mm_per_s = np.zeros(self._count) if speed is None else read_values(speed, slice(self._count))
         reports = self._open_column("stage_reports", (2,), "f") if self.moving else None
         self.stage_reports = np.empty((0, 2)) if reports is None else read_values(reports)
-        if self.holds_lines:
-            self._require_stored(self._lines, int(np.count_nonzero(~self.has_image)), "centre lines")
-        self._require_stored(images, int(np.count_nonzero(self.has_image)), "images")
+        # HDF5 returns zeros for chunks that were never stored.
+        if (stored := images.id.get_num_chunks()) < self._count:
+            raise CaptureError(f"{self.path} is damaged: it holds {stored} of {self._count} images")
         self.stage_mm, self.pose, self.laser_on, self.exposure_ms, self.time_s = (
             read_values(columns[name], slice(self._count)) for name in PER_FRAME
         )
@@ -258,7 +220,7 @@ class Capture(AbstractContextManager["Capture"]):
         if unfinished and self._count > 1 and self.time_s[-1] < self.time_s[-2]:
             # The writer was killed between extending the datasets and storing its last frame.
             self._count -= 1
-            for name in (*PER_FRAME, *MORE, *([] if self.pose_covariance is None else [COVARIANCE])):
+            for name in (*PER_FRAME, SPEED, *([] if self.pose_covariance is None else [COVARIANCE])):
                 setattr(self, name, getattr(self, name)[: self._count])
         if (np.diff(self.time_s) < 0).any():
             raise CaptureError(f"{self.path} holds times that decrease")
@@ -279,11 +241,6 @@ class Capture(AbstractContextManager["Capture"]):
         if known.any():
             require_covariances(covariances[known], self.path)
         return covariances
-
-    def _require_stored(self, parts: h5py.Dataset, count: int, called: str) -> None:
-        # HDF5 returns zeros for chunks that were never stored.
-        if parts.id.get_num_chunks() < count:
-            raise CaptureError(f"{self.path} is damaged: it holds {parts.id.get_num_chunks()} of {count} {called}")
 
     def _open_dataset(self, name: str, shape: tuple[int, ...], kind: str) -> h5py.Dataset:
         """Return a dataset with one row of this shape per frame; raises CaptureError for any other dataset."""
@@ -319,49 +276,28 @@ class Capture(AbstractContextManager["Capture"]):
         """Return the plan of an unfinished recording, or None."""
         return read_plan(self.file)
 
-    def read_observation(self, index: int) -> Seen:
-        """Return the image (H, W) or centre line of a frame; raises CaptureError if its data are damaged."""
+    def image(self, index: int) -> np.ndarray:
+        """Return the image (H, W) of a frame; raises CaptureError if its data are damaged."""
         if not 0 <= index < self._count:
             raise IndexError(f"frame {index} of {self._count}")
         try:
-            if self.has_image[index]:
-                return read_values(self._images, index)
-            rows = read_values(self._lines, index)
+            return read_values(self._images, index)
         except DAMAGE as error:
             raise CaptureError(f"frame {index} of {self.path} cannot be read: the file is damaged ({error})") from error
-        return self._stripe(rows, index)
-
-    def _stripe(self, rows: np.ndarray, index: int) -> Stripe:
-        centre, amplitude, width, status = rows
-        along = self.header.sensor.camera.stripe_along
-        length = self._images.shape[1 if along == "width" else 2]
-        good = status == StripeStatus.OK
-        known = np.isin(status, list(StripeStatus)).all() and np.array_equal(good, np.isfinite(centre))
-        if not known or (centre[good] < -0.5).any() or (centre[good] > length - 0.5).any():
-            raise CaptureError(
-                f"frame {index} of {self.path} is damaged: its centre line has places beyond 0 to {length - 1} px, or "
-                "none where its status says that there is one"
-            )
-        return Stripe(centre, amplitude.astype(np.float32), width.astype(np.float32), status.astype(np.uint8), along)
-
-    def image(self, index: int) -> np.ndarray:
-        """Return the image (H, W) of a frame; raises ImageError for a centre line, CaptureError for damaged data."""
-        return require_image(self.read_observation(index), f"frame {index} of {self.path.name}")
 
     def __getitem__(self, index: int) -> Frame:
         """Return a frame with its metadata; raises CaptureError if its data are damaged."""
         known: dict[str, Any]
         index = index + self._count if index < 0 else index
-        seen = self.read_observation(index)
+        image = self.image(index)
         columns = (self.stage_mm, self.laser_on, self.exposure_ms, self.time_s)
-        known = {"speed_mm_per_s": self.speed_mm_per_s[index].item()}
-        known["encoder"] = self.encoder[index].item() if np.isfinite(self.encoder[index]) else None
+        known = {SPEED: self.speed_mm_per_s[index].item()}
         for name, values in (("pose", self.pose), (COVARIANCE, self.pose_covariance)):
             known[name] = values[index] if values is not None and np.isfinite(values[index]).all() else None
-        return Frame(seen, *(column[index].item() for column in columns), **known)
+        return Frame(image, *(column[index].item() for column in columns), **known)
 
     def frames(self, *, laser_on: bool | None = None) -> Iterator[tuple[int, np.ndarray]]:
-        """Iterate over indices and images, of one light if given; raises ImageError at a centre line."""
+        """Iterate over indices and images, of one light if given."""
         for index in range(self._count):
             if laser_on is None or bool(self.laser_on[index]) == laser_on:
                 yield index, self.image(index)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from io import BufferedReader
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import h5py
 import hdf5plugin
@@ -16,14 +16,13 @@ from uwlts.errors import CaptureError, ImageError, OutputError
 from uwlts.files.json_files import describe_differences
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.model.sensor import CaptureHeader, Table, is_rigid
-from uwlts.model.stripe import ROWS, Stripe, stack_rows
 from uwlts.storage.capture import (
     CAPTURES,
     COVARIANCE,
     FORMAT,
-    MORE,
     PER_FRAME,
     POSE_ROUNDED,
+    SPEED,
     VERSION,
     Capture,
     Frame,
@@ -41,11 +40,10 @@ except ImportError:
 class CaptureWriter(AbstractContextManager["CaptureWriter"]):
     """Recording of a capture, as a context manager: a normal exit finishes the file, an exception keeps the part.
 
-    ``header`` describes all frames, ``dtype`` is that of their images, uint8 or uint16. With ``centre_lines``, laser
-    frames are centre lines. With ``moving``, frames have a speed, and `place` adds the stage's reports. With
-    ``covariances``, they may have a covariance of their pose. ``plan`` describes the recording as JSON, and is kept in
-    the part but not in the finished capture. ``overwrite`` replaces an existing capture or part, ``resume`` continues
-    a part.
+    ``header`` describes all frames, ``dtype`` is that of their images, uint8 or uint16. With ``moving``, frames have a
+    speed, and `place` adds the stage's reports. With ``covariances``, they may have a covariance of their
+    pose. ``plan`` describes the recording as JSON, and is kept in the part but not in the finished capture.
+    ``overwrite`` replaces an existing capture or part, ``resume`` continues a part.
 
     OutputError if the file exists or is an input of the running command, a part exists, or writing fails; CaptureError
     if the part to resume is damaged, or has another header or plan.
@@ -57,7 +55,6 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         header: CaptureHeader,
         *,
         dtype: np.dtype,
-        centre_lines: bool = False,
         moving: bool = False,
         plan: Table | None = None,
         covariances: bool = False,
@@ -70,10 +67,9 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         camera = header.sensor.camera
         self._shape, self._dtype = (camera.height_px, camera.width_px), np.dtype(dtype)
         self._frame_bytes = camera.height_px * camera.width_px * self._dtype.itemsize
-        self._lines, self._moving = camera.lines() if centre_lines else 0, moving
+        self._moving = moving
         self._columns: dict[str, tuple[tuple[int, ...], type]] = {COVARIANCE: ((6, 6), float)} if covariances else {}
-        self._version = VERSION if self._lines or moving else 1
-        self._columns |= MORE if self._version > 1 else {}
+        self._columns |= {SPEED: ((), float)} if moving else {}
         # The time is written last: its length is the number of frames.
         self._columns |= PER_FRAME
         if self._dtype not in (np.uint8, np.uint16):
@@ -92,7 +88,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             self._file = h5py.File(self._part, "r+", libver="latest", locking=False)
             self._file.swmr_mode = True
             self._locked = _lock(self._part)
-            self._arrays = _arrays(self._file)
+            self._arrays = _list_data_sets(self._file)
 
     def _open_part(self) -> "Capture":
         """Open the unfinished recording to continue; raises CaptureError if it is not one of this capture."""
@@ -100,10 +96,8 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             unfinished = Capture(self._part)
         except CaptureError as error:
             raise CaptureError(f"cannot resume: {error}; give `overwrite` to start again") from error
-        held = unfinished.header, unfinished.dtype, unfinished.plan()
-        there = _dump_recording(*held, lines=unfinished.holds_lines, moving=unfinished.moving)
-        kinds = {"lines": bool(self._lines), "moving": self._moving}
-        wanted = _dump_recording(self.header, self._dtype, self._plan, **kinds)
+        there = _dump_recording(unfinished.header, unfinished.dtype, unfinished.plan(), moving=unfinished.moving)
+        wanted = _dump_recording(self.header, self._dtype, self._plan, moving=self._moving)
         if others := describe_differences(there, wanted):
             unfinished.close()
             raise CaptureError(
@@ -122,23 +116,19 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         try:
             with h5py.File(fresh, "w", libver="latest", locking=False) as self._file:
                 claim_space(self._file, self._frame_bytes)
-                write_label(self._file, file_format=FORMAT, version=self._version, header=self.header)
+                write_label(self._file, file_format=FORMAT, version=VERSION if self._moving else 1, header=self.header)
                 if self._plan is not None:
                     write_plan(self._file, self._plan)
                 # The checksum detects damage that would otherwise be decompressed to another image.
-                parts = {"frames": (self._shape, self._dtype)}
-                if self._lines:
-                    parts["centre_lines"] = (len(ROWS), self._lines), np.dtype(float)
-                for name, (shape, dtype) in parts.items():
-                    self._file.create_dataset(
-                        name,
-                        (0, *shape),
-                        dtype,
-                        maxshape=(None, *shape),
-                        chunks=(1, *shape),
-                        fletcher32=True,
-                        **hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE),
-                    )
+                self._file.create_dataset(
+                    "frames",
+                    (0, *self._shape),
+                    self._dtype,
+                    maxshape=(None, *self._shape),
+                    chunks=(1, *self._shape),
+                    fletcher32=True,
+                    **hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE),
+                )
                 if self._moving:
                     self._file.create_dataset("stage_reports", (0, 2), float, maxshape=(None, 2), chunks=(256, 2))
                 for name, (shape, kind) in self._columns.items():
@@ -146,7 +136,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
                     # No checksum: if a kill interrupts the rewriting of a chunk, it would lose 256 rows instead of the
                     # last one.
                     self._file.create_dataset(name, (0, *shape), kind, maxshape=(None, *shape), chunks=chunks)
-                self._arrays = _arrays(self._file)
+                self._arrays = _list_data_sets(self._file)
                 for frame in unfinished:
                     self._store(frame)
             truncate(fresh)
@@ -164,15 +154,15 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         Raises
         ------
         ImageError
-            The frame has another size or type than the capture, or is an image with the laser on in a capture of centre
-            lines.
+            The frame has another size or type than the capture.
         CaptureError
             Stage position, exposure, time or pose is not finite, or the exposure is negative. The time is before that
             of the last frame. The pose is not a rotation with a shift (4, 4).
         OutputError
             Writing fails; earlier frames are kept.
         """
-        self._require_fitting(frame)
+        if (image := frame.image).shape != self._shape or image.dtype != self._dtype:
+            raise ImageError(f"frame is {image.shape} {image.dtype}, the capture holds {self._shape} {self._dtype}")
         if frame.speed_mm_per_s and not self._moving:
             raise CaptureError(f"a frame moves by {frame.speed_mm_per_s:g} mm/s in a capture of a stage at rest")
         if not np.isfinite([frame.stage_mm, frame.exposure_ms, frame.time_s]).all() or frame.exposure_ms < 0:
@@ -208,25 +198,9 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
                 dataset[...] = values
                 dataset.flush()
 
-    def _require_fitting(self, frame: Frame) -> None:
-        seen = frame.seen
-        if isinstance(seen, Stripe):
-            if len(seen.centre_px) != self._lines:
-                held = f"centre lines of {self._lines} profile lines" if self._lines else "images"
-                raise ImageError(f"frame is a centre line of {len(seen.centre_px)} lines, the capture holds {held}")
-        elif seen.shape != self._shape or seen.dtype != self._dtype:
-            raise ImageError(f"frame is {seen.shape} {seen.dtype}, the capture holds {self._shape} {self._dtype}")
-        elif self._lines and frame.laser_on:
-            raise ImageError("frame is an image with the laser on, the capture holds centre lines for these")
-
     def _store(self, frame: Frame) -> None:
         claim_space(self._file, self._frame_bytes)
-        line = stack_rows(frame.seen) if isinstance(frame.seen, Stripe) else None
-        # Chunks of a dataset that are not written take no space.
-        values: dict[str, Any] = {"frames": frame.seen if line is None else None} | (
-            {"centre_lines": line} if self._lines else {}
-        )
-        known = vars(frame) | {"has_image": line is None}
+        known, values = vars(frame), {"frames": frame.image}
         values |= {
             name: np.full(shape, np.nan) if known[name] is None else known[name]
             for name, (shape, _) in self._columns.items()
@@ -235,8 +209,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         for name, value in values.items():
             dataset = self._arrays[name]
             dataset.resize(count + 1, axis=0)
-            if value is not None:
-                dataset[count] = value
+            dataset[count] = value
             dataset.flush()
         self._last_s = frame.time_s
 
@@ -278,13 +251,12 @@ def _lock(part: Path) -> BufferedReader:
     return file
 
 
-def _dump_recording(header: CaptureHeader, dtype: np.dtype, plan: Table | None, *, lines: bool, moving: bool) -> Table:
+def _dump_recording(header: CaptureHeader, dtype: np.dtype, plan: Table | None, *, moving: bool) -> Table:
     """Return a description of a recording as JSON."""
-    held = f"{dtype}{' and centre lines' if lines else ''}{', moving' if moving else ''}"
-    return {"plan": plan, "images": held, "header": header.model_dump(mode="json")}
+    return {"plan": plan, "images": f"{dtype}{', moving' if moving else ''}", "header": header.model_dump(mode="json")}
 
 
-def _arrays(file: h5py.File) -> dict[str, h5py.Dataset]:
+def _list_data_sets(file: h5py.File) -> dict[str, h5py.Dataset]:
     """Return the datasets of a capture by name."""
-    names = ("frames", "centre_lines", "stage_reports", *MORE, COVARIANCE, *PER_FRAME)
+    names = ("frames", "stage_reports", SPEED, COVARIANCE, *PER_FRAME)
     return {name: cast(h5py.Dataset, file[name]) for name in names if name in file}

@@ -8,12 +8,10 @@ from pathlib import Path
 from typing import Literal
 
 import cv2
-import numpy as np
 import tomli_w
 
 from uwlts.errors import CaptureError, OutputError
 from uwlts.files.writing import require_possible_name
-from uwlts.model.stripe import stack_rows
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud_files import (
@@ -27,7 +25,6 @@ from uwlts.storage.cloud_files import (
 from uwlts.storage.import_.folder_description import NAME
 from uwlts.storage.import_.matching import POSE_COLUMNS
 from uwlts.storage.number_tables import Unit
-from uwlts.stripe import Stripe
 
 HEADER, TABLE = "header.json", "frames.csv"
 _COLUMNS = ("file", "light", "stage_mm", "exposure_ms", "time_s")
@@ -114,9 +111,8 @@ def export_capture(
 ) -> None:
     """Write a capture's frames without loss as images of the same depth into a new folder, completely or not at all.
 
-    Centre lines become arrays (.npy) of a profile (1, 4, L): centre, amplitude, width and status of every line. The
-    folder also contains header.json, import.toml, and frames.csv with the columns file, light, stage_mm, exposure_ms,
-    time_s and, if any frame has one, the elements of the pose.
+    The folder also contains header.json, import.toml, and frames.csv with the columns file, light, stage_mm,
+    exposure_ms, time_s and, if any frame has one, the elements of the pose.
 
     Raises OutputError if the folder exists, its parent is missing, or writing fails; CaptureError if a frame is
     damaged.
@@ -132,28 +128,20 @@ def export_capture(
         rows = []
         for index, frame in enumerate(capture):
             light = "laser" if frame.laser_on else "lamp"
-            if isinstance(frame.seen, Stripe):
-                name = f"{index:05d}-{light}.npy"
-                np.save(aside / name, stack_rows(frame.seen)[None])
-            else:
-                name = f"{index:05d}-{light}.{image_format}"
-                _, encoded = cv2.imencode(f".{image_format}", frame.seen)
-                (aside / name).write_bytes(encoded.tobytes())
+            name = f"{index:05d}-{light}.{image_format}"
+            _, encoded = cv2.imencode(f".{image_format}", frame.image)
+            (aside / name).write_bytes(encoded.tobytes())
             pose = [] if frame.pose is None else frame.pose.ravel().tolist()
-            encoder = [] if not capture.holds_lines else ["" if frame.encoder is None else frame.encoder]
-            rows.append([name, light, frame.stage_mm, frame.exposure_ms, frame.time_s, *encoder, *pose])
+            rows.append([name, light, frame.stage_mm, frame.exposure_ms, frame.time_s, *pose])
             progress(index + 1, len(capture))
         # Only captures with a pose have its columns, which are the last ones.
-        columns = (*_COLUMNS, "encoder") if capture.holds_lines else _COLUMNS
-        width = max(map(len, rows), default=len(columns))
+        width = max(map(len, rows), default=len(_COLUMNS))
         with open(aside / TABLE, "w", newline="", encoding="utf-8") as file:
             table = csv.writer(file, lineterminator="\n")
-            table.writerow((*columns, *POSE_COLUMNS)[:width])
+            table.writerow((*_COLUMNS, *POSE_COLUMNS)[:width])
             table.writerows([*row, *[""] * (width - len(row))] for row in rows)
         (aside / HEADER).write_text(capture.header.model_dump_json(indent=2) + "\n", encoding="utf-8")
         description = {"header": HEADER, "table": TABLE, "repeated": True}
-        if capture.holds_lines:
-            description |= {"centre_lines": {}}
         (aside / NAME).write_text(tomli_w.dumps(description), encoding="utf-8")
         os.rename(aside, folder)
     except OSError as error:

@@ -116,11 +116,11 @@ def time_gaps(names: Sequence[str], times_s: np.ndarray) -> list[str]:
     return [f"the times jump by {steps[place]:.4g} s {after}, usually by {usual:.4g} s: images may be missing"]
 
 
-def unwrap_counts(counts: ArrayLike, bits: int | None = None, *, returns: bool = False) -> np.ndarray:
+def unwrap_counts(counts: ArrayLike, bits: int | None = None) -> np.ndarray:
     """Return counts (N,) that continue where the counter passes the end of its range.
 
     Counts are in the order of time. The width ``bits`` is by default that for which the steps at overflows are like the
-    others. ``returns``: the stage may return to measure the same positions again.
+    others.
 
     Raises DescriptionError if the counts exceed the counter, a jump may be an overflow of a counter of unknown width,
     or the counter starts again.
@@ -146,10 +146,10 @@ def unwrap_counts(counts: ArrayLike, bits: int | None = None, *, returns: bool =
         break
     # A jump against the motion that no other step comes near is a restart.
     against = steps * -np.sign(np.median(steps)) if len(steps) else steps
-    if not returns and (worst := against.max(initial=0)) > _PLAIN * max(-against.min(initial=0), 1):
+    if (worst := against.max(initial=0)) > _PLAIN * max(-against.min(initial=0), 1):
         place = int(np.argmax(against))
         raise DescriptionError(
             f"the encoder jumps back from {counts[place]:.0f} to {counts[place + 1]:.0f} after image {place + 1}, by "
-            f"{worst:.0f} counts: its counter started again, or the stage returned (repeated = true)"
+            f"{worst:.0f} counts: its counter started again"
         )
     return counts

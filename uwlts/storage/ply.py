@@ -67,10 +67,8 @@ def read_comments(path: Path) -> list[str]:
     return _read_header(path, called="cloud").comments
 
 
-def encode_ply(
-    columns: Mapping[str, np.ndarray], *, faces: np.ndarray | None = None, comments: Sequence[str] = ()
-) -> bytes:
-    """Return a binary, little-endian file of vertices with columns (N,) as properties, and of triangles (F, 3)."""
+def encode_ply(columns: Mapping[str, np.ndarray], *, comments: Sequence[str] = ()) -> bytes:
+    """Return a binary, little-endian file of vertices with columns (N,) as properties."""
     kinds = {name: values.dtype.newbyteorder("<") for name, values in columns.items()}
     vertices = np.empty(len(next(iter(columns.values()))), list(kinds.items()))
     for name, values in columns.items():
@@ -78,15 +76,7 @@ def encode_ply(
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {each}" for each in comments)]
     header += [f"element vertex {len(vertices)}"]
     header += [f"property {_NAMES[kind.str[1:]]} {name}" for name, kind in kinds.items()]
-    tables = [vertices]
-    if faces is not None:
-        header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
-        rows = np.empty(len(faces), [("count", "u1"), ("vertices", "<i4", (3,))])
-        rows["count"], rows["vertices"] = 3, faces
-        tables.append(rows)
-    return b"".join(
-        ["\n".join([*header, "end_header", ""]).encode("ascii"), *(each.view("u1").data for each in tables)]
-    )
+    return b"".join(["\n".join([*header, "end_header", ""]).encode("ascii"), vertices.view("u1").data])
 
 
 def _fault(path: Path, what: str) -> CaptureError:

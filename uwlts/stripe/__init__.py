@@ -10,7 +10,7 @@ processes all laser images of a capture and explains missing stripes.
 
 from uwlts.model.stripe import CaptureStripes, Stripe, StripeCandidates, StripeStatus
 from uwlts.stripe.capture_stripes import explain_missing_stripe, find_stripes
-from uwlts.stripe.extract import extract_candidates, extract_stripe, find_stripe, warm_up
+from uwlts.stripe.extract import extract_candidates, extract_stripe, warm_up
 from uwlts.stripe.methods import method_names
 from uwlts.stripe.options import PeakRule, StripeOptions, StripeSettings
 
@@ -25,7 +25,6 @@ __all__ = [
     "explain_missing_stripe",
     "extract_candidates",
     "extract_stripe",
-    "find_stripe",
     "find_stripes",
     "method_names",
     "warm_up",

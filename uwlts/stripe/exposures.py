@@ -18,7 +18,6 @@ from typing import Protocol
 import numpy as np
 
 from uwlts.model.sensor import LEAST_BRACKET_STEP, MOST_IN_BRACKET, CaptureHeader
-from uwlts.model.stripe import Stripe
 
 
 def mark_clipped(image: np.ndarray, clipped: np.ndarray, *, saturation_dn: int) -> np.ndarray:
@@ -70,7 +69,7 @@ _MAD_TO_STD = 1.4826  # standard deviation of Gaussian noise divided by its medi
 
 
 class BracketImages(Protocol):
-    """Numbered sequence of images or centre lines with exposure and place, such as an open capture."""
+    """Numbered sequence of images with exposure and place, such as an open capture."""
 
     @property
     def path(self) -> Path: ...
@@ -90,11 +89,6 @@ class BracketImages(Protocol):
     @property
     def pose(self) -> np.ndarray: ...
 
-    @property
-    def has_image(self) -> np.ndarray: ...
-
-    def read_observation(self, index: int) -> np.ndarray | Stripe: ...
-
     def image(self, index: int) -> np.ndarray: ...
 
     def __len__(self) -> int: ...
@@ -105,11 +99,11 @@ def group_brackets(capture: BracketImages) -> list[np.ndarray]:
 
     A bracket consists of successive images at one place whose exposures differ by at least `LEAST_BRACKET_STEP`. A
     recording has brackets if at least two places have equally many such images; the last place may have fewer.
-    Otherwise each image or centre line is a bracket of its own.
+    Otherwise each image is a bracket of its own.
     """
     laser = np.flatnonzero(capture.laser_on)
     alone = [laser[k : k + 1] for k in range(len(laser))]
-    if len(laser) < 4 or not capture.has_image[laser].all():
+    if len(laser) < 4:
         return alone
     stage, pose, exposure = (values[laser] for values in (capture.stage_mm, capture.pose, capture.exposure_ms))
     moved = np.abs(np.diff(stage)) > _Rule.same_place_mm
@@ -125,16 +119,16 @@ def group_brackets(capture: BracketImages) -> list[np.ndarray]:
     return alone if exposure.min() <= 0 or np.concatenate(steps).any() else [laser[place] for place in places]
 
 
-def fuse_brackets(capture: BracketImages) -> Iterator[tuple[int, np.ndarray | Stripe, float]]:
+def fuse_brackets(capture: BracketImages) -> Iterator[tuple[int, np.ndarray, float]]:
     """Yield number, image (H, W) and grey value of saturation for each place with the laser on.
 
-    A single image or centre line is returned unchanged. A bracket gives its `fuse_exposures` image with the number of
+    A single image is returned unchanged. A bracket gives its `fuse_exposures` image with the number of
     the longest exposure.
     """
     full_dn = float(capture.header.saturation_dn)
     for numbers in group_brackets(capture):
         if len(numbers) == 1:
-            yield int(numbers[0]), capture.read_observation(int(numbers[0])), full_dn
+            yield int(numbers[0]), capture.image(int(numbers[0])), full_dn
         else:
             images = [capture.image(number) for number in numbers.tolist()]
             yield int(numbers[-1]), *fuse_exposures(images, capture.exposure_ms[numbers], full_dn=full_dn)

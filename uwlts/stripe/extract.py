@@ -235,32 +235,18 @@ def extract_candidates(
     return found.find_candidates(np.arange(len(found.stripe.status)))
 
 
-def find_stripe(
-    seen: np.ndarray | Stripe, *, stripe_along: str, options: StripeOptions = StripeOptions(), saturation: float | None
-) -> Stripe:
-    """Return the stripe of an image (`extract_stripe`) or of a 3D camera's centre line, without its ends.
-
-    For a 3D camera only `StripeOptions.end_lines` is used.
-    """
-    if isinstance(seen, Stripe):
-        return leave_ends_out(seen, options)
-    return extract_stripe(seen, stripe_along=stripe_along, options=options, saturation=saturation)
-
-
-def direct_stripe_in(
-    seen: np.ndarray | Stripe, *, stripe_along: str, options: StripeOptions, saturation: float
-) -> Stripe:
-    """Return the stripe as `find_stripe`, under the rule `PeakRule.DIRECT` without reflections."""
-    if isinstance(seen, Stripe) or options.peak is not PeakRule.DIRECT:
-        return find_stripe(seen, stripe_along=stripe_along, options=options, saturation=saturation)
-    found = _search_image(seen, stripe_along, options, None, saturation)
+def direct_stripe_in(image: np.ndarray, *, stripe_along: str, options: StripeOptions, saturation: float) -> Stripe:
+    """Return the stripe as `extract_stripe`, under the rule `PeakRule.DIRECT` without reflections."""
+    if options.peak is not PeakRule.DIRECT:
+        return extract_stripe(image, stripe_along=stripe_along, options=options, saturation=saturation)
+    found = _search_image(image, stripe_along, options, None, saturation)
     stripe, rivals = found.stripe, found.find_rivals()
     if rivals is not None:
         stripe = direct_stripe(stripe, rivals, jump_px=found.options.jump_px)
     return found.complete(stripe)
 
 
-def leave_ends_out(stripe: Stripe, options: StripeOptions) -> Stripe:
+def _leave_ends_out(stripe: Stripe, options: StripeOptions) -> Stripe:
     """Return the stripe without its last lines before an end or a jump; see `StripeOptions.end_lines`.
 
     The omitted lines have the status END. A stripe ends if more than two consecutive lines lack a centre. The border
@@ -396,7 +382,7 @@ class _SearchedImage:
 
     def complete(self, stripe: Stripe) -> Stripe:
         """Return the stripe without its ends, with the centres of `StripeOptions.low_pass` if it is set."""
-        stripe, tolerance = leave_ends_out(stripe, self.options), self.options.low_pass
+        stripe, tolerance = _leave_ends_out(stripe, self.options), self.options.low_pass
         if tolerance is None:
             return stripe
         return fit_low_passed(self.profiles, stripe, tolerance=tolerance, fitted_px=self.options.low_pass_fit_px)

@@ -26,21 +26,33 @@ WELD = {"kind": "weld", "beads": 1, "undercut_depth_mm": (0.02, 0.4)}
 RUNS = 100
 
 
-def test_the_logistic_of_hits_and_misses_is_found_and_its_bound_holds():
-    """Of 100 bounds at 95 %, fewer than 87 hold once in 3,000 runs (binomial)."""
-    location, scale = math.log(0.1), 0.2
+@pytest.mark.parametrize(
+    ("count", "scale", "deepest_mm"),
+    [(80, 0.2, 0.5), (40, 0.08, 0.6), (40, 0.15, 0.3), (40, 0.3, 0.9), (60, 0.06, 0.4)],
+)
+def test_the_logistic_of_hits_and_misses_is_found_and_its_bound_holds(count, scale, deepest_mm):
+    """Of 100 bounds at 95 %, fewer than 87 hold once in 3,000 runs (binomial); a missing bound states nothing wrong.
+
+    The designs were not used to choose the penalty. The plain likelihood's bounds hold in 73 to 91.
+    """
+    location = math.log(0.1)
     true = 0.1 * math.exp(scale * math.log(9))
     rng = np.random.default_rng(1823)
-    found, held = [], 0
+    found, held, bounded = [], 0, 0
     for _ in range(RUNS):
-        depth = np.exp(rng.uniform(math.log(0.02), math.log(0.5), 80))
-        hit = rng.random(80) < 1 / (1 + np.exp(-(np.log(depth) - location) / scale))
+        # Even in the logarithm, as depths of campaigns (`pit_depths`).
+        share = (np.arange(count) + rng.random(count)) / count
+        depth = 0.02 * (deepest_mm / 0.02) ** share
+        hit = rng.random(count) < 1 / (1 + np.exp(-(np.log(depth) - location) / scale))
         fitted = fit_hit_miss(depth, hit)
-        assert fitted.a90_mm is not None and fitted.a90_95_mm is not None
-        assert fitted.a90_mm < fitted.a90_95_mm
+        assert fitted.a90_mm is not None
         found.append(math.log(fitted.a90_mm / true))
-        held += fitted.a90_95_mm >= true
+        bound = math.inf if fitted.a90_95_mm is None else fitted.a90_95_mm
+        assert fitted.a90_mm < bound
+        held += bound >= true
+        bounded += bound < math.inf
     assert held >= 87
+    assert bounded >= 90
     # A single a90 scatters by some 15 %; the bias of the mean of 100 is small beside it.
     assert abs(np.mean(found)) < 0.08
 

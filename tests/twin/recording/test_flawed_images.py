@@ -38,10 +38,9 @@ TYPICAL = [
     "row-noise=5",
     "jpeg=90",
     "colour-filter",
-    "camera-3d=16",
 ]
 NAMES = [text.partition("=")[0] for text in TYPICAL]
-UNSEEN = "rolling-shutter", "caustics", "row-noise", "camera-3d"  # without motion, daylight, noise and in images
+UNSEEN = "rolling-shutter", "caustics", "row-noise"  # without motion, daylight and noise
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,7 @@ class DrawnCapture:
 
     def __post_init__(self) -> None:
         count = len(self.images)
-        self.laser_on = self.has_image = np.ones(count, bool)
+        self.laser_on = np.ones(count, bool)
         self.exposure_ms = np.ones(count)
         camera = SimpleNamespace(stripe_along="width")
         self.header = SimpleNamespace(saturation_dn=4095, sensor=SimpleNamespace(camera=camera))

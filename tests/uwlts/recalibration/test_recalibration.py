@@ -9,6 +9,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from tests.system.in_process import uwlts
+from tests.uwlts.drawn_stripes import draw_centres
 from tests.uwlts.joint_views import Noise, gathered, seen, target_series
 from tests.waiting import within
 from twin.scene.campaign import replace_values
@@ -22,7 +23,6 @@ from uwlts.model.artefacts import PipeStandard, PlaneStandard, StepStandard
 from uwlts.model.library import load_sensor
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import CaptureHeader, Medium
-from uwlts.model.stripe import Coordinates
 from uwlts.recalibration.as_built import as_built
 from uwlts.recalibration.pass_estimate import MotionUncertainty, Pass, PassProblem, solve_passes
 from uwlts.recalibration.recalibrate import summarise
@@ -353,11 +353,11 @@ def test_passes_without_overlap_are_refused():
 
 
 def write_capture(path, each):
-    """Write a pass as a capture of a 3D camera."""
-    with CaptureWriter(path, HEADER, dtype=np.uint8, centre_lines=True) as writer:
+    """Write a pass as a capture."""
+    with CaptureWriter(path, HEADER, dtype=np.uint8) as writer:
         for number, position in enumerate(TRAVEL):
-            stripe = coordinates_of(each, each.frame == number)
-            writer.append(Frame(stripe, float(position), True, 1.0, float(number)))
+            image = image_of(each, each.frame == number)
+            writer.append(Frame(image, float(position), True, 1.0, float(number)))
 
 
 def test_the_command_writes_a_calibration_only_without_doubts(tmp_path, monkeypatch):
@@ -414,7 +414,7 @@ def survey(path, built_passes, *, moved_mm=0.0):
     The poses of the second pass are stated ``moved_mm`` beside their place.
     """
     along = np.eye(4)
-    with CaptureWriter(path, HEADER, dtype=np.uint8, centre_lines=True, covariances=True) as writer:
+    with CaptureWriter(path, HEADER, dtype=np.uint8, covariances=True) as writer:
         for turn, each in enumerate(built_passes):
             for number, position in list(enumerate(TRAVEL))[:: 1 - 2 * (turn % 2)]:
                 own = each.frame == number
@@ -422,13 +422,13 @@ def survey(path, built_passes, *, moved_mm=0.0):
                 pose = each.pose[number] @ along
                 pose[2, 3] += moved_mm * (turn == 1)
                 known = np.diag([0.01**2] * 3 + [1e-10] * 3)
-                stripe = coordinates_of(each, own)
-                writer.append(Frame(stripe, 0.0, True, 1.0, float(len(writer)), pose=pose, pose_covariance=known))
+                image = image_of(each, own)
+                writer.append(Frame(image, 0.0, True, 1.0, float(len(writer)), pose=pose, pose_covariance=known))
     return path
 
 
-def coordinates_of(each, own):
-    """Return the stripe of an image of a pass, with independent noise on each line of the sensor."""
+def image_of(each, own):
+    """Return an image of a pass, whose stripe has independent noise on each line of the sensor."""
     camera = SENSOR.camera
     centre, order = np.full(camera.width_px, np.nan), np.argsort(each.line[own])
     line = each.line[own][order]
@@ -438,7 +438,7 @@ def coordinates_of(each, own):
     inner = inner[np.diff(line)[np.searchsorted(line, inner) - 1] < 10.0]
     centre[inner] = CubicSpline(line, each.centre_px[own][order])(inner)
     centre += NOISE_PX * np.random.default_rng(int(1e6 * line[0])).normal(size=len(centre))
-    return Coordinates().stripe(centre, stripe_along="width", length_px=camera.height_px)
+    return draw_centres(centre, camera.height_px, stripe_along="width")
 
 
 def test_a_scan_with_overlaps_checks_itself(tmp_path, monkeypatch):

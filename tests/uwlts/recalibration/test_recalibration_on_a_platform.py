@@ -16,9 +16,9 @@ from tests.uwlts.recalibration.test_recalibration import (
     SENSOR,
     WATER,
     check_derivatives,
-    coordinates_of,
     draw_sensor,
     draw_surface,
+    image_of,
 )
 from uwlts.calibration.joint.stored_estimate import read_stored_estimate
 from uwlts.model.calibration import rigid_transform
@@ -170,10 +170,10 @@ def write_scans(folder, problem):
     for each, (*_, speed) in zip(problem.passes, WAYS, strict=True):
         at_s = began + (TRAVEL - TRAVEL[0]) / speed
         header = HEADER.model_copy(update={"name": each.name})
-        with CaptureWriter(folder / f"{each.name}.h5", header, dtype=np.uint8, centre_lines=True) as writer:
+        with CaptureWriter(folder / f"{each.name}.h5", header, dtype=np.uint8) as writer:
             for number, time_s in enumerate(at_s):
-                stripe = coordinates_of(each, each.frame == number)
-                writer.append(Frame(stripe, 0.0, True, 1.0, float(time_s)))
+                image = image_of(each, each.frame == number)
+                writer.append(Frame(image, 0.0, True, 1.0, float(time_s)))
         more = np.linspace(-2.0, 2.0 + at_s[-1] - began, 200)
         way = np.repeat(each.pose[:1], len(more), axis=0)
         way[:, :3, 3] = each.pose[0, :3, 3] + speed * more[:, None] * each.rates[0, :3] / speed

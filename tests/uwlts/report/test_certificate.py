@@ -10,15 +10,7 @@ import pytest
 import uwlts
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import MEDIUM, joint_calibration
-from uwlts.calibration.joint.observability import SheetRegion, list_regions, project_sheet_points, read_region_estimate
-from uwlts.errors import CalibrationError, CaptureError, OutputError
-from uwlts.files.json_files import compute_seal, to_canonical_json
-from uwlts.model.calibration import KnownMedium
-from uwlts.optics.nominal import nominal_calibration
-from uwlts.optics.triangulation import reconstruct_pixels
-from uwlts.report.certificate import certificate_lines, check_certificate, make_certificate, read_certificate
-from uwlts.report.certificate_page import certificate_page, write_certificate
-from uwlts.report.certificate_volume import (
+from uwlts.calibration.joint.calibrated_volume import (
     compare_calibrations,
     compute_volume_lengths,
     find_ends,
@@ -27,6 +19,14 @@ from uwlts.report.certificate_volume import (
     remove_rigid_motion,
     uncertainty_maps,
 )
+from uwlts.calibration.joint.observability import SheetRegion, list_regions, project_sheet_points, read_region_estimate
+from uwlts.errors import CalibrationError, CaptureError, OutputError
+from uwlts.files.json_files import compute_seal, to_canonical_json
+from uwlts.model.calibration import KnownMedium
+from uwlts.optics.nominal import nominal_calibration
+from uwlts.optics.triangulation import reconstruct_pixels
+from uwlts.report.certificate import certificate_lines, check_certificate, make_certificate, read_certificate
+from uwlts.report.certificate_page import certificate_page, write_certificate
 from uwlts.storage.calibration_file import load_calibration
 
 BUILT = built_sensor()

@@ -8,18 +8,17 @@ import numpy as np
 import pytest
 
 import uwlts
-from tests.uwlts.comparison.test_surface_mesh import NOISE_MM
 from uwlts.cli import app
 from uwlts.errors import EvaluationError, OutputError, SetupError
 from uwlts.files.writing import hash_file
 from uwlts.inspection.features import Feature, FeatureKind, Inspection
+from uwlts.inspection.findings_order import FindingOrder
 from uwlts.model.artefacts import SphereStandard
 from uwlts.pages import toolkit
 from uwlts.report.findings_page import _conclude
-from uwlts.report.measured_values import FindingOrder
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
 
-DEPTH_MM = 1.5
+DEPTH_MM, NOISE_MM = 1.5, 0.02
 
 
 @pytest.fixture(scope="module")

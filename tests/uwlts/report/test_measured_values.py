@@ -7,12 +7,12 @@ from itertools import product
 import numpy as np
 import pytest
 
-from tests.uwlts.desk.test_analyses import step_cloud
+from tests.uwlts.desk.test_analyses import weld_cloud
 from uwlts.errors import DescriptionError, OutputError
 from uwlts.evaluation.figures import FigureUncertainty
-from uwlts.inspection.picking import PickedMeasurement
+from uwlts.inspection.picking import MeasuredValues, PickedMeasurement, read_measured
 from uwlts.report import write_findings
-from uwlts.report.measured_values import MeasuredValues, read_measured, write_measured
+from uwlts.report.findings_page import write_measured
 
 WITHOUT = "the cloud has no uncertainty"
 # Expanded uncertainty 2 * sqrt(3^2 + 4^2) = 10 um.
@@ -115,10 +115,10 @@ def test_page_list_and_table_have_the_same_values(tmp_path):
 
 
 def test_a_findings_report_shows_the_list(tmp_path):
-    step_cloud().save(tmp_path / "plate.ply")
+    weld_cloud().save(tmp_path / "plate.ply")
     write_measured(tmp_path / "plate.measured.html", listed(LENGTH).limit(1, None, 4.0), title="A")
     write_findings(
-        tmp_path / "plate.ply", "step", out=tmp_path / "plate.html", measured=tmp_path / "plate.measured.json"
+        tmp_path / "plate.ply", "weld", out=tmp_path / "plate.html", measured=tmp_path / "plate.measured.json"
     )
     text = (tmp_path / "plate.html").read_text(encoding="utf-8")
     assert "Values measured by hand" in text and "<td>exceeds the limit</td>" in text

@@ -1,12 +1,10 @@
 """Reading of any file of the program with one function, and saving of results."""
 
-import struct
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-import trimesh
 
 import uwlts
 from uwlts.errors import CaptureError, OutputError
@@ -15,7 +13,6 @@ from uwlts.model.trajectory import Trajectory
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.report.file_description import describe
 from uwlts.storage.cloud import PointCloud
-from uwlts.storage.mesh_file import SurfaceMesh
 
 
 def cloud_of(count: int) -> PointCloud:
@@ -38,52 +35,6 @@ def test_results_are_saved_and_read_back(tmp_path: Path):
     np.testing.assert_array_equal(uwlts.read(tmp_path / "a.csv").times_s, path.times_s)
 
 
-def tetrahedron() -> SurfaceMesh:
-    """A mesh with every attribute that a PLY file has."""
-    vertices = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 10]])
-    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
-    normals = vertices - vertices.mean(axis=0)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return SurfaceMesh(vertices, normals, faces, np.arange(4.0), np.arange(4.0)[::-1].copy(), 1.0, 2.0, 0.1, {"a": 1})
-
-
-def test_a_saved_mesh_is_read_with_its_uncertainty(tmp_path: Path):
-    mesh = tetrahedron()
-    mesh.save(tmp_path / "a.ply")
-    found = uwlts.read(tmp_path / "a.ply")
-    assert isinstance(found, SurfaceMesh)
-    for name in ("vertices_mm", "faces", "noise_mm", "shared_mm"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(mesh, name))
-    # Normals are stored with 32 bits: half a step below 1 is 2^-25.
-    np.testing.assert_allclose(found.normals, mesh.normals, rtol=0, atol=2**-25)
-    assert found.lines()[0] == mesh.lines()[0] and len(found.lines()) == 2
-
-
-@pytest.mark.parametrize("name", ["a.stl", "a.obj", "a.ply"])
-def test_meshes_of_other_programs_have_normals_of_their_faces(tmp_path: Path, name: str):
-    mesh = tetrahedron()
-    trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False).export(tmp_path / name)
-    found = uwlts.read(tmp_path / name)
-    assert isinstance(found, SurfaceMesh)
-    assert found.vertices_mm.shape == (4, 3) and found.faces.shape == (4, 3) and not found.std_mm.any()
-    assert found.area_mm2() == pytest.approx(mesh.area_mm2(), rel=1e-6), "STL has 32 bits"
-    # The faces are anticlockwise from outside.
-    assert (np.einsum("vi,vi->v", found.normals, found.vertices_mm - found.vertices_mm.mean(axis=0)) > 0).all()
-
-
-def test_damaged_meshes_are_refused(tmp_path: Path):
-    tetrahedron().save(tmp_path / "a.ply")
-    whole = (tmp_path / "a.ply").read_bytes()
-    (tmp_path / "a.ply").write_bytes(whole[:-20])
-    with pytest.raises(CaptureError, match=r"a\.ply is not a complete"):
-        uwlts.read(tmp_path / "a.ply")
-    (tmp_path / "a.obj").write_text("v 0 0 0\n")
-    with pytest.raises(CaptureError, match=r"a\.obj"):
-        uwlts.read(tmp_path / "a.obj")
-    with pytest.raises(CaptureError, match="no file at"):
-        uwlts.read(tmp_path / "missing.stl")
-
-
 def test_a_saved_evaluation_is_read_as_an_evaluation(tmp_path: Path):
     points = np.random.default_rng(2).uniform(-20, 20, (500, 3)) * [1, 1, 0]
     cloud = PointCloud(points, np.ones(500), np.zeros(500), np.arange(500), metadata={"artefact": {"kind": "plane"}})
@@ -101,8 +52,7 @@ def test_an_unreadable_file_is_refused_with_the_readable_formats(tmp_path: Path)
         file.attrs["format"] = np.bytes_("another")
     for name, found in (("a.json", "uwlts-unknown"), ("a.doc", ".doc"), ("a.h5", "another")):
         with pytest.raises(
-            CaptureError,
-            match=f"{found}.*this reads captures and ground truth .* meshes .* evaluations .* trajectories",
+            CaptureError, match=f"{found}.*this reads captures and ground truth .* evaluations .* trajectories"
         ):
             uwlts.read(tmp_path / name)
     with pytest.raises(CaptureError, match=r"missing\.h5"):
@@ -158,25 +108,3 @@ def test_a_nominal_calibration_reports_its_medium(tmp_path):
         assert uwlts.read(tmp_path / f"{name}.json") == calibration
     # Without a name, files are as before, so that the digests in older clouds stay valid.
     assert "medium_name" not in nominal_calibration(sensor).model_dump_json()
-
-
-def test_a_ply_with_two_lists_on_a_face_is_a_mesh(tmp_path: Path):
-    mesh = tetrahedron()
-    header = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
-    header += "element face 4\nproperty list uchar int vertex_indices\nproperty list uchar float other\nend_header\n"
-    rows = [" ".join(map(str, row)) for row in mesh.vertices_mm.tolist()]
-    faces = mesh.faces.tolist()
-    rows += [f"3 {' '.join(map(str, face))} {n} {'0.5 ' * n}" for n, face in enumerate(faces)]
-    (tmp_path / "a.ply").write_text(header + "\n".join(rows) + "\n")
-    content = header.replace("ascii", "binary_little_endian").encode() + mesh.vertices_mm.astype("<f4").tobytes()
-    for n, face in enumerate(faces):
-        content += struct.pack(f"<B3iB{n}f", 3, *face, n, *[0.5] * n)
-    (tmp_path / "b.ply").write_bytes(content)
-    for name in ("a.ply", "b.ply"):
-        assert uwlts.read(tmp_path / name).area_mm2() == pytest.approx(mesh.area_mm2())
-
-
-def test_a_missing_texture_is_silent(tmp_path: Path, caplog: pytest.LogCaptureFixture):
-    (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd missing.png\n")
-    (tmp_path / "a.obj").write_text("mtllib a.mtl\nusemtl m\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n")
-    assert uwlts.read(tmp_path / "a.obj").area_mm2() == pytest.approx(0.5) and not caplog.records

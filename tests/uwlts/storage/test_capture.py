@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -111,6 +112,21 @@ def test_everything_comes_back(tmp_path: Path, dtype: type, with_pose: bool):
         assert capture.laser_on.dtype == bool
 
 
+def test_a_moving_stage_has_speeds_and_reports(tmp_path: Path):
+    path, written = tmp_path / "m.h5", {"dtype": np.dtype(np.uint8), "moving": True}
+    with pytest.raises(KeyboardInterrupt), CaptureWriter(path, a_header(), **written) as writer:
+        writer.append(replace(a_frame(0), speed_mm_per_s=3.0))
+        raise KeyboardInterrupt
+    with pytest.raises(CaptureError, match="belongs to another recording"):
+        CaptureWriter(path, a_header(), dtype=np.dtype(np.uint8), resume=True)
+    with CaptureWriter(path, a_header(), **written, resume=True) as writer:
+        writer.append(a_frame(1))
+        writer.place(np.array([0.5, 0.75]), np.array([2.5, 2.5]), np.array([[0.0, 0.5], [0.1, 0.75], [0.2, 1.0]]))
+    with Capture(path) as capture:
+        assert capture.moving and capture.stage_reports.shape == (3, 2)
+        assert capture.stage_mm.tolist() == [0.5, 0.75] and capture.speed_mm_per_s.tolist() == [2.5, 2.5]
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_big_endian_numbers_become_those_of_the_machine(tmp_path: Path, dtype: type):
     """Compiled functions refuse arrays in another byte order."""
@@ -126,7 +142,7 @@ def test_big_endian_numbers_become_those_of_the_machine(tmp_path: Path, dtype: t
         assert found.dtype == dtype and found.pose.dtype.isnative and found.stage_mm.dtype.isnative
         assert np.array_equal(found.pose, expected.pose, equal_nan=True)
         for one, other in zip(found, expected, strict=True):
-            assert one.seen.dtype.isnative and np.array_equal(one.seen, other.seen) and one.time_s == other.time_s
+            assert one.image.dtype.isnative and np.array_equal(one.image, other.image) and one.time_s == other.time_s
 
 
 def test_a_process_that_writes_no_capture_reads_one(tmp_path: Path):
@@ -679,6 +695,10 @@ CONTRADICTIONS = {
     "endless exposure": (lambda file: file["exposure_ms"].__setitem__(1, np.inf), "not finite"),
     "no time": (lambda file: file["time_s"].__setitem__(1, np.nan), "not finite"),
     "images never stored": (never_stored, "holds 4 of 7 images"),
+    "centre lines of a 3D camera": (
+        lambda file: file.create_dataset("centre_lines", data=np.zeros((4, 4, WIDTH))),
+        "centre lines of a 3D camera, expected images only: read it with uwlts 0.2",
+    ),
 }
 
 

@@ -12,7 +12,6 @@ from tests.uwlts.storage.test_cloud import some_cloud
 from uwlts.errors import CaptureError
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import is_cloud, read_cloud, read_parts, read_thinned_cloud, write_cloud
-from uwlts.storage.mesh_file import read_mesh
 
 
 # All digits; half a unit in the last of 24 binary digits of coordinates below 2 m; half a step of 1e-4 mm.
@@ -113,14 +112,6 @@ def test_ply_comments_hold_any_bytes(tmp_path: Path, text: str, encoding: str):
     comment = b"comment " + text.encode(encoding, "replace") + b"\nobj_info \xff\xfe\n"
     (tmp_path / "a.ply").write_bytes(ply(np.arange(12.0).reshape(4, 3), comment=comment))
     assert read_cloud(tmp_path / "a.ply").points_mm.tolist() == np.arange(12.0).reshape(4, 3).tolist()
-
-
-def test_comments_of_meshes_hold_any_bytes(tmp_path: Path):
-    face = b"element face 1\nproperty list uchar int vertex_indices\nend_header\n"
-    points = np.array([[0.0, 0, 0], [2, 0, 0], [0, 3, 0]])
-    content = ply(points, comment="comment Gebäude\n".encode("latin-1")).replace(b"end_header\n", face)
-    (tmp_path / "a.ply").write_bytes(content + b"\3" + np.arange(3, dtype="<i4").tobytes())
-    assert read_mesh(tmp_path / "a.ply").area_mm2() == pytest.approx(3.0)
 
 
 @pytest.mark.parametrize("name", ["intensity", "Intensity", "scalar_Intensity", "SCALAR_INTENSITY"])

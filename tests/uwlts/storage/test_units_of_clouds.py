@@ -17,6 +17,7 @@ from tests.uwlts.mount_views import sphere_campaign
 from uwlts.cli import app
 from uwlts.storage.cloud import make_foreign_cloud
 from uwlts.storage.cloud_files import read_cloud, read_region, write_cloud, write_ply_points
+from uwlts.storage.mesh_file import load_triangles
 
 POINTS_MM = np.random.default_rng(1).uniform(-50, 50, (400, 3))
 
@@ -133,7 +134,7 @@ def test_comments_of_ply_obj_and_stl_state_a_unit(tmp_path: Path, caplog: pytest
     content = box.export(file_type="stl")
     (tmp_path / "a.stl").write_bytes(b"by some program;UNITS=in".ljust(80, b"\0") + content[80:])
     for name in ("a.obj", "a.stl"):
-        assert uwlts.read(tmp_path / name).area_mm2() == pytest.approx(6 * 25.4**2)
+        assert load_triangles(tmp_path / name).area == pytest.approx(6 * 25.4**2)
 
 
 def test_e57_in_feet_is_asked_about(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -33,14 +33,14 @@ def found(*images: np.ndarray, options: StripeOptions = StripeOptions(), sensor:
     """Return the stripes found by `find_stripes` in images of one recording."""
     count = len(images)
     header = SimpleNamespace(sensor=load_sensor(sensor), saturation_dn=255)
-    about = {"laser_on": np.ones(count, bool), "has_image": np.ones(count, bool), "stage_mm": np.arange(float(count))}
+    about = {"laser_on": np.ones(count, bool), "stage_mm": np.arange(float(count))}
     about |= {"exposure_ms": np.ones(count), "pose": np.full((count, 4, 4), np.nan), "path": Path("drawn.h5")}
 
     class Images(SimpleNamespace):
         def __len__(self) -> int:
             return count
 
-    capture = Images(header=header, image=images.__getitem__, read_observation=images.__getitem__, **about)
+    capture = Images(header=header, image=images.__getitem__, **about)
     return find_stripes(capture, options=options)
 
 

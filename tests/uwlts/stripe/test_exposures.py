@@ -26,7 +26,6 @@ def recording(stage_mm, exposure_ms, laser_on=None, pose=None):
     return SimpleNamespace(
         stage_mm=np.asarray(stage_mm, float),
         exposure_ms=np.asarray(exposure_ms, float),
-        has_image=np.ones(count, bool),
         laser_on=np.ones(count, bool) if laser_on is None else np.asarray(laser_on, bool),
         pose=np.full((count, 4, 4), np.nan) if pose is None else pose,
     )

@@ -227,7 +227,7 @@ def solve(evidence: Evidence, *, options: CalibrationOptions) -> CalibrationResu
             text = f"their sheets differ by {np.degrees(angle):.3f} deg"
             warnings += half_doubt(text, difference=angle, std=sheet.normal_std_rad)
     figures["sheet"] = sheet.figures(stripe_points, angle)
-    warnings += _turn_warnings(camera, sheet, evidence)
+    warnings += _warn_of_turns(camera, sheet, evidence)
     warnings += _warn_of_uncertainty(camera, sheet, sensor)
     calibration = Calibration(
         sensor_name=sensor.name,
@@ -432,7 +432,7 @@ def _describe_stage_tilt(
     return warning
 
 
-def _turn_warnings(camera: CameraSolution, sheet: SheetSolution, evidence: Evidence) -> list[str]:
+def _warn_of_turns(camera: CameraSolution, sheet: SheetSolution, evidence: Evidence) -> list[str]:
     warnings = []
     if sheet.turn_rad > _LARGEST_USUAL_TURN:
         warnings.append(f"the sheet's normal is {np.degrees(sheet.turn_rad):.1f} deg away from the description's")

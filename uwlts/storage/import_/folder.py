@@ -2,7 +2,7 @@
 
 import math
 from collections import defaultdict
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +17,6 @@ from uwlts.storage.capture import CAPTURES, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.image_file import ImageHeader, read_image
 from uwlts.storage.import_.bag_images import is_bag, unpack_images
-from uwlts.storage.import_.centre_lines import profile_rows
 from uwlts.storage.import_.folder_description import (
     NAME,
     ImportDescription,
@@ -36,8 +35,7 @@ from uwlts.storage.import_.grey_values import (
     subtract_background,
 )
 from uwlts.storage.import_.matching import ImageRow, match, planned_frames, read_rows, stage_remark
-from uwlts.stripe import Stripe
-from uwlts.stripe.capture_stripes import BLACK, FEWEST_LINES, WHITE, find_stripe_direction, is_black
+from uwlts.stripe.capture_stripes import BLACK, WHITE, find_stripe_direction, is_black
 
 _SIZE_ADVICE = {
     (True, True): "the images are rotated by 90 deg: rotate them back, or exchange width_px and height_px of the "
@@ -91,11 +89,6 @@ class _Content:
         """Look for a stripe in a laser image (H, W) as it is stored."""
         direction = find_stripe_direction(image, stripe_along=self._stripe_along, saturation=saturation_dn)
         self._found[direction or "none"].append(name)
-
-    def add_line(self, stripe: Stripe, name: str) -> None:
-        """Note a centre line."""
-        self._found["laser"].append(name)
-        self._found["along" if len(stripe.lines) >= FEWEST_LINES else "none"].append(name)
 
     def refuse_black(self) -> None:
         """Raise ImageError if all laser images are black, or all lamp images although there is a target."""
@@ -224,17 +217,11 @@ def _import_folder(
     sensor = described_sensor(given, beside=path.parent)
     rows = None if given.table is None else read_rows(path.parent / given.table)
     matched = match(folder, given, rows)
-    if given.centre_lines is not None:
-        laser = profile_rows(matched.laser, given.centre_lines, sensor.camera, folder=folder, repeated=given.repeated)
-        matched = replace(matched, laser=laser)
     frames, doubts = planned_frames(given, matched, in_table=rows is not None)
     reader = _Reader(given, sensor, folder)
-    images = [row for row in frames if row.profile is None]
-    bits, zero = sensor.detector.bits, 0
-    if images:
-        *_, bits = reader.image(images[0].file, laser_on=images[0].light == "laser")
-        subtracted = any(row.background is not None for row in frames)
-        zero = _find_zero_dn(given, bits) if subtracted or reader.derives else 0
+    *_, bits = reader.image(frames[0].file, laser_on=frames[0].light == "laser")
+    subtracted = any(row.background is not None for row in frames)
+    zero = _find_zero_dn(given, bits) if subtracted or reader.derives else 0
     saturation = 2**bits - 1 if given.saturation_dn is None else given.saturation_dn
     header = capture_header(
         given,
@@ -245,27 +232,20 @@ def _import_folder(
         remarks=_list_remarks(given, frames, name, bits=bits, zero_dn=zero),
     )
     saturation = reader.saturation_dn = saturation if given.header is None else header.saturation_dn
-    if images and saturation > np.iinfo(reader.dtype).max:
+    if saturation > np.iinfo(reader.dtype).max:
         raise DescriptionError(f"saturation_dn is {saturation}; images of {reader.dtype} have no such value")
     in_time = _is_in_order(frames)
     content = _Content(header.sensor.camera.stripe_along, saturation, target=header.target is not None)
-    held = reader.dtype if images else np.dtype(np.uint8)
-    dtype = np.dtype(np.uint16) if zero else held
-    lines = given.centre_lines is not None
-    writer = CaptureWriter(out, header, dtype=dtype, centre_lines=lines, overwrite=overwrite)
+    dtype = np.dtype(np.uint16) if zero else reader.dtype
+    writer = CaptureWriter(out, header, dtype=dtype, overwrite=overwrite)
     try:
         with writer:
             for number, row in enumerate(frames):
                 # An unknown exposure or time is stored as 0, as stated in the provenance.
                 exposure_ms, time_s = np.nan_to_num([row.exposure_ms, row.time_s if in_time else 0.0]).tolist()
-                encoder = None
-                if row.profile is not None:
-                    content.add_line(row.profile, row.file)
-                    image, encoder = row.profile, None if math.isnan(row.encoder) else row.encoder
-                else:
-                    image = _store_image(row, reader, content, zero_dn=zero, saturation_dn=header.saturation_dn)
-                    image = image.astype(dtype, copy=False)
-                writer.append(Frame(image, row.stage_mm, row.light == "laser", exposure_ms, time_s, row.pose, encoder))
+                image = _store_image(row, reader, content, zero_dn=zero, saturation_dn=header.saturation_dn)
+                image = image.astype(dtype, copy=False)
+                writer.append(Frame(image, row.stage_mm, row.light == "laser", exposure_ms, time_s, row.pose))
                 progress(number + 1, len(frames))
             content.refuse_black()
     except BaseException:
@@ -371,7 +351,7 @@ def _list_remarks(given: ImportDescription, frames: list[ImageRow], folder: str,
     remarks |= {
         key: getattr(given, key) for key in ("bayer", "channel", "lamp_channel", "intrinsics") if getattr(given, key)
     }
-    name = frames[0].file.lower() if frames else ""
+    name = frames[0].file.lower()
     if bits == 8 and (given.channel or name.endswith((".jpg", ".jpeg"))):
         remarks["response"] = "not known: 8-bit photographs are usually not proportional to light"
     if zero_dn:

@@ -56,22 +56,6 @@ class StageMotion(Description):
         return self
 
 
-class CentreLines(Description):
-    """Laser files with the centre lines of a 3D camera, one number per profile line, instead of images.
-
-    A position in px is ``scale`` times the number plus ``offset``; the number ``invalid`` marks lines without a stripe.
-    ``table`` is a CSV file with a row for each profile: any of stage_mm, exposure_ms, time_s and encoder. With
-    ``mm_per_count`` the encoder, a counter of ``encoder_bits``, gives the stage's positions (`unwrap_counts`).
-    """
-
-    scale: Annotated[float, Field(gt=0)] = 1.0
-    offset: float = 0.0
-    invalid: float | None = None
-    table: str | None = None
-    mm_per_count: float | None = None
-    encoder_bits: Annotated[int, Field(ge=8, le=52)] | None = None
-
-
 class ImportDescription(Description):
     """Description of a folder of images.
 
@@ -80,7 +64,6 @@ class ImportDescription(Description):
     optional ``base``. ``laser``, ``lamp``, ``background`` and ``ignore`` are patterns of file names; images that are
     both ``laser`` and ``lamp`` show the laser on the lit target. ``bayer`` is the pattern of a colour camera's raw
     images. ``table`` is a CSV file with the values of each image.
-    With ``centre_lines`` the laser files contain centre lines of one or more profiles.
     """
 
     header: str | None = None
@@ -102,7 +85,6 @@ class ImportDescription(Description):
     exposure_ms: NotNegative | None = None
     lamp_exposure_ms: NotNegative | None = None
     repeated: bool = False
-    centre_lines: CentreLines | None = None
     stage: StageMotion = StageMotion()
     target: Table | None = None
     artefact: Table | None = None
@@ -117,8 +99,6 @@ class ImportDescription(Description):
         twice += ["stage.direction"] if self.stage.direction is not None else []
         if self.header is not None and twice:
             raise ValueError(f"the header gives {', '.join(twice)} already: leave out one of the two")
-        if self.centre_lines is not None and (self.background or self.channel is not None):
-            raise ValueError("centre lines have neither background nor channel: leave these out; lamp_channel may stay")
         return self
 
     def channel_of_lamp(self, image: np.ndarray) -> str | None:

@@ -19,12 +19,11 @@ from uwlts.storage.image_file import SUFFIXES
 from uwlts.storage.import_.folder_description import ImportDescription, Patterns
 from uwlts.storage.numbering import Counted, count_names, name_gaps, time_gaps
 from uwlts.storage.pose_files import check_matrices
-from uwlts.stripe import Stripe
 
 POSE_COLUMNS = tuple(f"pose_{row}{column}" for row in range(4) for column in range(4))
 """Elements of ``T_scene_object``, row by row."""
 
-_NUMBERS = ("stage_mm", "exposure_ms", "time_s", "encoder")
+_NUMBERS = ("stage_mm", "exposure_ms", "time_s")
 _COLUMNS = ("file", "light", "background", *_NUMBERS, *POSE_COLUMNS)
 _MOST_TABLE_BYTES = 8 * 2**20  # a hundred thousand images
 _LIGHTS = ("laser", "lamp", "both", "ignore")
@@ -32,7 +31,7 @@ _LIGHTS = ("laser", "lamp", "both", "ignore")
 
 @dataclass(frozen=True, eq=False)
 class ImageRow:
-    """One image or ``profile``: paths relative to the folder, NaN and None if unknown; ``number`` is the order."""
+    """One image: paths relative to the folder, NaN and None if unknown; ``number`` is the order."""
 
     file: str
     number: int = 0
@@ -42,8 +41,6 @@ class ImageRow:
     exposure_ms: float = math.nan
     time_s: float = math.nan
     pose: np.ndarray | None = None
-    encoder: float = math.nan
-    profile: Stripe | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +55,7 @@ class Matched:
 def read_rows(path: Path) -> list[ImageRow]:
     """Read a CSV table with the column ``file``, separated by commas or semicolons.
 
-    Further columns are any of light, background, stage_mm, exposure_ms, time_s, encoder, pose_00 to pose_33. Raises
+    Further columns are any of light, background, stage_mm, exposure_ms, time_s, pose_00 to pose_33. Raises
     DescriptionError if the table is missing or empty, or has an unknown column, a repeated file, an unknown light, or a
     cell that is not a number.
     """
@@ -75,7 +72,7 @@ def read_rows(path: Path) -> list[ImageRow]:
     if not {"file"} <= set(columns) <= set(_COLUMNS) or len(set(columns)) < len(columns):
         raise DescriptionError(
             f"{path} has the columns {', '.join(columns)}; expected file and any of "
-            f"{', '.join(_COLUMNS[1:7])}, pose_00 to pose_33, each once"
+            f"{', '.join(_COLUMNS[1:6])}, pose_00 to pose_33, each once"
         )
     rows = [_parse_row(number, cells, f"{path}, line {line}") for number, (line, cells) in enumerate(found)]
     twice = sorted(name for name, count in Counter(row.file for row in rows).items() if count > 1)
@@ -95,7 +92,7 @@ def _parse_row(number: int, cells: dict[str, str], place: str) -> ImageRow:
     light = texts["light"].lower() or None
     if light is not None and light not in _LIGHTS:
         raise DescriptionError(f"{place}: the light is {light!r}; expected {', '.join(_LIGHTS)}")
-    numbers: dict[str, Any] = {name: _number(texts[name], f"{place}: {name}") for name in (*_NUMBERS, *POSE_COLUMNS)}
+    numbers: dict[str, Any] = {name: _parse(texts[name], f"{place}: {name}") for name in (*_NUMBERS, *POSE_COLUMNS)}
     pose = np.array([numbers.pop(name) for name in POSE_COLUMNS]).reshape(4, 4)
     given = np.count_nonzero(np.isfinite(pose))
     if given not in (0, 16):
@@ -107,7 +104,7 @@ def _parse_row(number: int, cells: dict[str, str], place: str) -> ImageRow:
     return ImageRow(texts["file"], number, light, texts["background"] or None, pose=pose if given else None, **numbers)
 
 
-def _number(text: str, place: str) -> float:
+def _parse(text: str, place: str) -> float:
     """Return the finite number of a cell, NaN if it is empty."""
     try:
         value = float(text) if text else 0.0
@@ -124,16 +121,12 @@ def _refuse_any(names: list[str], before: str, after: str) -> None:
         raise DescriptionError(f"{before}{', '.join(names[:3])}{after}")
 
 
-def image_files(folder: Path, *, more: tuple[str, ...] = ()) -> list[str]:
-    """Return the paths of the images in a folder and its subfolders, in natural order.
-
-    Files with ``more`` endings count as well. Raises ImageError if there is no image.
-    """
-    wanted = (*SUFFIXES, *more)
-    found = [path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in wanted]
+def image_files(folder: Path) -> list[str]:
+    """Return the paths of the images in a folder and its subfolders, in natural order; ImageError if there is none."""
+    found = [path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES]
     files = [name.as_posix() for name in found if not any(part.startswith(".") for part in name.parts)]
     if not files:
-        raise ImageError(f"{folder} holds no image: expected files that end with {', '.join(wanted)}")
+        raise ImageError(f"{folder} holds no image: expected files that end with {', '.join(SUFFIXES)}")
     return sorted(files, key=natural_key)
 
 
@@ -143,7 +136,7 @@ def match(folder: Path, given: ImportDescription, rows: list[ImageRow] | None) -
     Raises ImageError if the folder contains no image; DescriptionError if no image has a role, an image has two, a
     named file is missing, or the background of an image is ambiguous.
     """
-    files = image_files(folder, more=(".csv", ".npy") if given.centre_lines else ())
+    files = image_files(folder)
     known = [ImageRow(name) for name in files] if rows is None else rows
     missing = [row.file for row in known if not is_regular_file(folder / row.file)]
     _refuse_any(missing, "the table names ", f", which {folder} does not hold")
@@ -176,7 +169,6 @@ def match(folder: Path, given: ImportDescription, rows: list[ImageRow] | None) -
     dark = [name for name in files if matches(name, given.background) and name not in unwanted]
     laser = _add_backgrounds(folder, dark, given, laser)
     described = {name for row in (*laser, *lamp, *ignored) for name in (row.file, row.background)} | unwanted
-    described |= {given.table, given.centre_lines.table if given.centre_lines else None}
     unmatched = [name for name in files if name not in described]
     return Matched(laser, lamp, unmatched)
 
@@ -294,16 +286,14 @@ def _count_images(lights: dict[str, list[ImageRow]]) -> tuple[dict[str, list[int
     found: dict[str, Counted] = {}
     warnings = []
     for light, rows in lights.items():
-        names = [*dict.fromkeys(row.file for row in rows)]
+        names = [row.file for row in rows]
         counted = count_names(names)
         gaps = name_gaps(names, counted)
-        if gaps and len(names) < len(rows):
-            raise DescriptionError(f"{gaps[0]}, so that positions of profiles are unknown: import the files apart")
-        if counted is not None and len(names) == len(rows):
+        if counted is not None:
             found[light] = counted
         warnings += [f"{gap}. Positions from start_mm follow the numbers, positions_mm the order" for gap in gaps]
         if not gaps:
-            warnings += time_gaps([row.file for row in rows], np.array([row.time_s for row in rows]))
+            warnings += time_gaps(names, np.array([row.time_s for row in rows]))
     shared = len(found) == 2 and bool(set.intersection(*(set(each.numbers.tolist()) for each in found.values())))
     first = min((int(each.numbers[0]) for each in found.values()), default=0) if shared else None
     return counts | {light: each.places(first).tolist() for light, each in found.items()}, warnings

@@ -7,7 +7,7 @@ import pytest
 
 from uwlts.errors import EvaluationError
 from uwlts.inspection.features import Feature, FeatureKind, plain_value
-from uwlts.report.measured_values import (
+from uwlts.inspection.findings_order import (
     FindingDatum,
     FindingLimits,
     format_place,
