@@ -47,6 +47,23 @@ def test_importing_a_script_does_not_load_drjit():
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.parametrize(
+    "module, left_out",
+    [
+        ("uwlts.desk.scan", ("nicegui", "fastapi", "scipy.stats", "uwlts.recalibration.recalibrate")),
+        ("uwlts.calibration.calibrate", ("scipy.stats", "scipy.signal", "nicegui")),
+        ("twin.recording.render", ("trimesh", "scipy.stats", "scipy.signal")),
+        ("twin.recording.sensor_simulator", ("trimesh", "scipy.stats", "scipy.signal")),
+        ("twin.design.sweep", ("plotly", "matplotlib", "scipy.stats")),
+    ],
+)
+def test_a_command_starts_without_libraries_that_few_runs_need(module, left_out):
+    """Each of them takes a second or more to import."""
+    code = f"import {module}, sys\nprint(sorted({set(left_out)!r} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
 @pytest.mark.filterwarnings("ignore:Cyclopts application invoked without tokens")
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_help_and_a_wrong_option(path, tmp_path, monkeypatch, capfd):

@@ -53,7 +53,7 @@ class PacedReplay(ReplayCamera):
         self._began_s, self._due = time.monotonic(), 0
         return super()._configure(wanted)
 
-    def _next(self, timeout_s: float) -> Delivered | None:
+    def _take_next(self, timeout_s: float) -> Delivered | None:
         self._due = max(self._due, int((time.monotonic() - self._began_s) * RATE_HZ) - BUFFERS)
         wait_s = self._began_s + self._due / RATE_HZ - time.monotonic()
         time.sleep(min(max(wait_s, 0.0), timeout_s))
@@ -152,7 +152,7 @@ def _followed(out: Path, record: Callable[[], Recorded]) -> Recorded:
 
 
 def _follow(out: Path, ready: multiprocessing.synchronize.Event, result: multiprocessing.connection.Connection) -> None:
-    """Follow a recording as `uwlts watch` does, without a browser."""
+    """Follow a recording and show its images on a board, without a browser."""
     sensor = load_sensor("thesis")
     calibration = nominal_calibration(sensor, sensor.medium("air"))
     moments: list[float] = []

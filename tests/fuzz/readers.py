@@ -39,7 +39,7 @@ from uwlts.comparison.change_reference import read_datums, read_reference, read_
 from uwlts.desk.guided_plan import load_guided_plan
 from uwlts.evaluation.evaluate import read_evaluation
 from uwlts.hardware.scan_plan import load_plan
-from uwlts.model.artefacts import read_artefact
+from uwlts.model.artefacts import resolve_artefact
 from uwlts.model.library import library_folder, load_sensor
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.report.certificate import check_certificate, make_certificate
@@ -412,7 +412,7 @@ READERS = {
         Reader("campaign", ".toml", "toml", _shipped("campaigns/demo.toml"), load_campaign),
         Reader("study", ".toml", "toml", _shipped("studies/baseline-angle.toml"), load_study),
         Reader("plan", ".toml", "toml", _plan, lambda path: load_plan(path).header("a")),
-        Reader("artefact", ".toml", "toml", _artefact, read_artefact),
+        Reader("artefact", ".toml", "toml", _artefact, resolve_artefact),
         Reader("import", ".toml", "toml", _import_description, _read_import),
         Reader("table", ".csv", "lines", _table, read_rows),
         Reader("mount", ".json", "json", _mount, read_mount),

@@ -155,6 +155,8 @@ class Runner:
                 sensor = [] if "--sensor" in rest else ["--sensor", small["thesis"]]
                 samples = [] if "--spp" in rest else ["--spp", _SAMPLES]
                 return ["twin", command, small.get(scene, scene), *rest, *sensor, *samples]
+            case ["twin", "predict", *_] if "--spp" not in words:
+                return [*words, "--spp", _SAMPLES]
             case ["twin", "sweep", study, *rest]:
                 return ["twin", "sweep", small.get(study, study), *rest]
             case ["uwlts", "nominal", sensor, *rest]:

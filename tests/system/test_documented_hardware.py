@@ -58,8 +58,6 @@ PAGES_RUN = {
             "settle_s = 0.2": "settle_s = 0.0",
         },
         prepare={"uwlts scan plan.toml --home --out scan.h5 --resume": without_capture},
-        again=("uwlts scan plan.toml --home --out scan.h5 --watch",),
-        ready={"uwlts watch": "http"},
     ),
     "docs/how-to/desk.md": Page(
         tables={"plan.toml": 0, "tank/plan.toml": 0},

@@ -222,7 +222,7 @@ def test_commands_are_answered_while_an_image_is_made(scene, camera):
     scene.seconds = 1.0
     camera.trigger()
     began = time.monotonic()
-    camera._answers()
+    camera._check_answer()
     assert time.monotonic() - began < 0.4
     assert camera.grab(WAIT_S).image[0, 1] == 5
 

@@ -58,7 +58,7 @@ class Camera(CameraDevice):
     def _close(self): pass
     def _start(self): pass
     def _stop(self): pass
-    def _answers(self): pass
+    def _check_answer(self): pass
     def _trigger(self):
         self.lit = Stage.opened.laser_power > 0
         if self.lit:
@@ -66,7 +66,7 @@ class Camera(CameraDevice):
         if self.lit and hangs == "trigger":
             time.sleep(60)
         self.due_s = time.monotonic() + 1e-3 * self.settings.exposure_ms
-    def _next(self, timeout_s):
+    def _take_next(self, timeout_s):
         if self.due_s is None: return None
         if self.lit and hangs == "frame":
             time.sleep(60)

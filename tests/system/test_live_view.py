@@ -1,12 +1,7 @@
-"""The page of a recording in progress: display of each image, and the command that serves it."""
+"""A recording in progress: display of each image, and images that are read while it grows."""
 
-import signal
-import socket
-import subprocess
-import sys
 import threading
 import time
-import urllib.request
 from pathlib import Path
 
 import cv2
@@ -22,8 +17,6 @@ from uwlts.model.sensor import Sensor
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def header(sensor: Sensor) -> CaptureHeader:
@@ -155,38 +148,3 @@ def test_a_recording_that_is_cut_off_is_not_waited_for(thesis, tmp_path, monkeyp
     with pytest.raises(CaptureError, match="a.h5.part"):
         for _ in followed:
             time.sleep(0.05)
-
-
-def test_the_page_is_served_to_this_machine_until_it_is_closed(thesis, tmp_path):
-    write(tmp_path / "live.h5", thesis, [(stripe_image(thesis, height_dn=150.0), True)])
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    watching = subprocess.Popen(
-        [sys.executable, "-m", "uwlts", "watch", str(tmp_path / "live.h5"), "--port", str(port)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        for line in watching.stdout:
-            if "is finished with 1 images" in line:
-                break
-        else:
-            pytest.fail(f"the command ended: {watching.stderr.read()}")
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=10) as answer:
-            text = answer.read()
-            assert answer.status == 200 and b"<title>live.h5" in text and b"Laser off" not in text
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/picture.jpg", timeout=10) as answer:
-            assert answer.read().startswith(b"\xff\xd8")
-        listening = Path("/proc/net/tcp").read_text().splitlines()[1:]
-        ports = [
-            row.split()[1] for row in listening if row.split()[3] == "0A" and row.split()[1].endswith(f"{port:04X}")
-        ]
-        assert ports and all(address.startswith("0100007F") for address in ports)
-        watching.send_signal(signal.SIGINT)
-        _, said = watching.communicate(timeout=20)
-        assert watching.returncode == 0 and "Traceback" not in said
-    finally:
-        watching.kill()
-        watching.wait()

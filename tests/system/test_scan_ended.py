@@ -137,10 +137,10 @@ def bench(camera: DrawnCamera, tmp_path: Path) -> Iterator[Bench]:
         yield Bench(camera, tmp_path, stack)
 
 
-def test_a_scan_killed_at_twelve_moments_loses_nothing(bench):
+def test_a_scan_killed_at_six_moments_loses_nothing(bench):
     """Each run is killed some ms after the laser's first, second or fourth light: in it or after it."""
     kept, plan = 0, bench.plan(count=MANY)
-    moments = [(light, after_ms) for after_ms in (0, 3, 10, 30) for light in (1, 2, 4)]
+    moments = [(1, 0), (2, 3), (4, 10), (2, 30), (1, 10), (4, 0)]
     for light, after_ms in moments:
         program = bench.start(plan)
         bench.wait(program, light)

@@ -2,17 +2,14 @@
 
 import subprocess
 import sys
-import time
-import urllib.request
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.waiting import within
 from twin.devices.serve import ServedTwin, serve
 from twin.scene.description import Scene, load_scene
-from uwlts.storage.capture import Capture, part_path
+from uwlts.storage.capture import Capture
 from uwlts.stripe import find_stripes
 
 pytestmark = pytest.mark.slow
@@ -121,67 +118,6 @@ def test_what_comes_nearer_later_is_taken_again_with_a_shorter_exposure(folder, 
         said.count("warning:") - said.count("lost between camera and computer") == 2
         and "laser images are faint" in said
     )
-
-
-def watched(folder: Path, served: ServedTwin, out: Path, *, count: int) -> subprocess.Popen[str]:
-    """A scan with its page, slow enough for the page to come."""
-    plan = folder / "watched.toml"
-    plan.write_text(
-        f'title = "Scan"\nsensor = "sensor.toml"\nmedium = "air"\ncamera = "{served.camera.address}"\n'
-        f'laser_ms = {served.exposure_ms["laser"]}\n[stage]\nport = "{served.controller.port}"\n'
-        f"start_mm = {served.track.start_mm}\nstep_mm = 2.0\ncount = {count}\nsettle_s = 0.5\n"
-        "feed_mm_per_min = 900.0\n",
-        encoding="utf-8",
-    )
-    return subprocess.Popen(
-        [sys.executable, "-m", "uwlts", "scan", str(plan), "--out", str(out), "--home", "--watch"],
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-
-
-def refused(address: str) -> bool:
-    """Return whether the page ends within five seconds."""
-    deadline = time.monotonic() + 5
-    while time.monotonic() < deadline:
-        try:
-            urllib.request.urlopen(address, timeout=2).close()
-        except OSError:
-            return True
-        time.sleep(0.1)
-    return False
-
-
-def test_a_killed_scan_takes_its_page_with_it_and_leaves_the_laser_off(folder, sensor, tmp_path):
-    with serve(load_scene(folder / "bar.toml"), sensor=sensor, spp=4, speed_up=50.0) as served:
-        with watched(folder, served, tmp_path / "scan.h5", count=61) as scanning:
-            lines = iter(scanning.stdout.readline, "")
-            address = next(line for line in lines if line.startswith("open ")).split()[1].rstrip(",")
-            urllib.request.urlopen(address, timeout=10).close()
-            while not served.controller.state().laser_on:
-                assert scanning.poll() is None
-            scanning.kill()
-            assert scanning.wait(10) < 0
-        assert refused(address)
-        # The guard process has seen the program end, and sent the reset.
-        assert within(1.0, lambda: not served.controller.state().laser_on)
-        with Capture(part_path(tmp_path / "scan.h5")) as part:
-            assert 1 <= len(part) < 61
-
-
-def test_the_page_is_there_while_the_scan_runs_and_ends_with_it(folder, sensor, tmp_path):
-    with (
-        serve(load_scene(folder / "bar.toml"), sensor=sensor, spp=4, speed_up=50.0) as served,
-        watched(folder, served, tmp_path / "scan.h5", count=24) as scanning,
-    ):
-        lines = iter(scanning.stdout.readline, "")
-        address = next(line for line in lines if line.startswith("open ")).split()[1].rstrip(",")
-        with urllib.request.urlopen(address, timeout=10) as answer:
-            assert answer.status == 200 and scanning.poll() is None
-        assert "wrote" in "".join(lines) and scanning.wait(60) == 0
-    assert refused(address)
-    with Capture(tmp_path / "scan.h5") as scan:
-        assert len(scan) == scan.header.provenance["images"] == 24
 
 
 def test_a_bracket_multiplies_the_exposure_that_was_found(folder, sensor, tmp_path):

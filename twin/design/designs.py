@@ -10,7 +10,6 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from scipy.stats import qmc
 
 from twin.design.figures_of_merit import FIGURES, Figures, compute_figures
 from twin.design.sensor_arrays import (
@@ -242,6 +241,8 @@ def sample_designs(study: Study, first: int, count: int) -> list[Design]:
         if study.sampling.kind == "random":
             shares = np.array([np.random.default_rng([seed, number]).random(variables) for number in numbers])
         else:
+            from scipy.stats import qmc
+
             sequence = qmc.Sobol(variables, rng=np.random.default_rng(seed))
             with warnings.catch_warnings():
                 # The warning asks for a power of two as length, which does not apply to a part of the sequence.

@@ -38,6 +38,7 @@ from uwlts.optics.design import (
 
 DEPTHS = 5  # number of evaluated depths, evenly spaced over the part of the measuring volume in the camera's view
 PLACES = 7  # number of evaluated points along the stripe at each depth
+_LINE_PLACES = 101  # the same where only the ends of the line in view are wanted
 _MANY = 200  # least number of designs that is worth the time to compile the formulas
 _BLOCK = 1000  # number of designs in a block of the compiled formulas
 _BRIGHT_LINES = 2.05
@@ -281,7 +282,7 @@ def evaluate_field(xp: ModuleType, p: SensorArrays, depth_mm: Array, places: Arr
     )
 
 
-def _figure(text: str, unit: str = "mm") -> Any:
+def _label(text: str, unit: str = "mm") -> Any:
     """Return a field of `Figures` with its label and unit for pages."""
     return field(metadata={"words": text, "unit": unit})
 
@@ -299,39 +300,39 @@ class Figures:
     middle of the volume.
     """
 
-    sigma_x_mm: np.ndarray = _figure("σ X, by the stage")
-    sigma_y_mm: np.ndarray = _figure("σ Y, largest in the volume")
-    sigma_z_mm: np.ndarray = _figure("σ Z, largest in the volume")
-    sigma_z_rms_mm: np.ndarray = _figure("σ Z, rms over the volume")
-    sigma_z_near_mm: np.ndarray = _figure("σ Z at the near end")  # root mean squares along the stripe
-    sigma_z_middle_mm: np.ndarray = _figure("σ Z in the middle")
-    sigma_z_far_mm: np.ndarray = _figure("σ Z at the far end")
-    depth_per_px_mm: np.ndarray = _figure("depth per pixel", "mm/px")
-    along_per_px_mm: np.ndarray = _figure("length along the stripe per pixel", "mm/px")
-    coverage: np.ndarray = _figure("fraction of the volume in reach", "")  # of camera and laser
-    standoff_mm: np.ndarray = _figure("stand-off")  # where the sheet crosses the camera's axis
-    near_mm: np.ndarray = _figure("near end of the volume")
-    far_mm: np.ndarray = _figure("far end of the volume")
-    depth_mm: np.ndarray = _figure("depth of the volume")
-    line_near_mm: np.ndarray = _figure("line length at the near end")
-    line_mm: np.ndarray = _figure("line length in the middle")
-    line_far_mm: np.ndarray = _figure("line length at the far end")
-    section_cm2: np.ndarray = _figure("area of the sheet in the volume", "cm²")  # that the camera sees
+    sigma_x_mm: np.ndarray = _label("σ X, by the stage")
+    sigma_y_mm: np.ndarray = _label("σ Y, largest in the volume")
+    sigma_z_mm: np.ndarray = _label("σ Z, largest in the volume")
+    sigma_z_rms_mm: np.ndarray = _label("σ Z, rms over the volume")
+    sigma_z_near_mm: np.ndarray = _label("σ Z at the near end")  # root mean squares along the stripe
+    sigma_z_middle_mm: np.ndarray = _label("σ Z in the middle")
+    sigma_z_far_mm: np.ndarray = _label("σ Z at the far end")
+    depth_per_px_mm: np.ndarray = _label("depth per pixel", "mm/px")
+    along_per_px_mm: np.ndarray = _label("length along the stripe per pixel", "mm/px")
+    coverage: np.ndarray = _label("fraction of the volume in reach", "")  # of camera and laser
+    standoff_mm: np.ndarray = _label("stand-off")  # where the sheet crosses the camera's axis
+    near_mm: np.ndarray = _label("near end of the volume")
+    far_mm: np.ndarray = _label("far end of the volume")
+    depth_mm: np.ndarray = _label("depth of the volume")
+    line_near_mm: np.ndarray = _label("line length at the near end")
+    line_mm: np.ndarray = _label("line length in the middle")
+    line_far_mm: np.ndarray = _label("line length at the far end")
+    section_cm2: np.ndarray = _label("area of the sheet in the volume", "cm²")  # that the camera sees
     # Largest angle between laser's and camera's rays: steeper walls hide one from the other.
-    occlusion_deg: np.ndarray = _figure("occlusion angle, largest", "°")
+    occlusion_deg: np.ndarray = _label("occlusion angle, largest", "°")
     # Scattering coefficient times the path from laser to camera: mean number of scatterings of the light.
-    scattering_depth: np.ndarray = _figure("optical depth of scattering, largest", "")
-    signal_e: np.ndarray = _figure("faintest signal", "e⁻")
-    exposure_ms: np.ndarray = _figure("exposure", "ms")  # as used
-    required_ms: np.ndarray = _figure("exposure required", "ms")  # that the wanted brightness takes
-    stripe_px: np.ndarray = _figure("width of the stripe's image (σ)", "px")  # largest in the volume, as the next two
-    blur_px: np.ndarray = _figure("the lens's blur (σ)", "px")
-    centre_px: np.ndarray = _figure("σ of the stripe's centre", "px")
-    speckle_limit_mm: np.ndarray = _figure("speckle limit of Z")  # Dorsch's, in the middle, for depolarised light
-    laser_class: np.ndarray = _figure("laser class", "")  # number after IEC 60825-1, see `CLASS_NAMES`, `laser_class`
-    window_mm: np.ndarray = _figure("window thickness needed")  # for the pressure at the study's depth
-    window_safety: np.ndarray = _figure("safety factor of the windows", "")  # of the weaker one, at the study's depth
-    baseline_mm: np.ndarray = _figure("width of the sensor")
+    scattering_depth: np.ndarray = _label("optical depth of scattering, largest", "")
+    signal_e: np.ndarray = _label("faintest signal", "e⁻")
+    exposure_ms: np.ndarray = _label("exposure", "ms")  # as used
+    required_ms: np.ndarray = _label("exposure required", "ms")  # that the wanted brightness takes
+    stripe_px: np.ndarray = _label("width of the stripe's image (σ)", "px")  # largest in the volume, as the next two
+    blur_px: np.ndarray = _label("the lens's blur (σ)", "px")
+    centre_px: np.ndarray = _label("σ of the stripe's centre", "px")
+    speckle_limit_mm: np.ndarray = _label("speckle limit of Z")  # Dorsch's, in the middle, for depolarised light
+    laser_class: np.ndarray = _label("laser class", "")  # number after IEC 60825-1, see `CLASS_NAMES`, `laser_class`
+    window_mm: np.ndarray = _label("window thickness needed")  # for the pressure at the study's depth
+    window_safety: np.ndarray = _label("safety factor of the windows", "")  # of the weaker one, at the study's depth
+    baseline_mm: np.ndarray = _label("width of the sensor")
 
 
 FIGURES: dict[str, tuple[str, str]] = {
@@ -340,16 +341,32 @@ FIGURES: dict[str, tuple[str, str]] = {
 """Label and unit of each figure of merit, by name."""
 
 
+def evaluate_sheet(p: SensorArrays, z_mm: np.ndarray, *, places: int, reflectance: float) -> Field:
+    """Return the `Field` (1, K, places) of one design at ``z_mm`` (K,) from the stand-off, along the whole stripe."""
+    with np.errstate(all="ignore"):
+        pose = p.pose(np)
+        depth = standoff_mm(pose) - p.outer_mm(np) + pose.axis[2] * z_mm.reshape(1, -1, 1)
+        along = np.linspace(-1, 1, places).reshape(1, 1, -1) * (1 - 1e-9)
+        return evaluate_field(np, p, depth, along, reflectance=reflectance)
+
+
+def find_line_ends(p: SensorArrays, z_mm: np.ndarray) -> np.ndarray:
+    """Return the ends (K, 2) along Y of the line that laser and camera of one design reach at ``z_mm`` (K,).
+
+    They are infinite, the first one above the second one, where there is no such line. ``z_mm`` counts from the
+    stand-off.
+    """
+    f = evaluate_sheet(p, z_mm, places=_LINE_PLACES, reflectance=0.5)
+    ends = np.where(f.in_view, f.y_mm, np.inf).min(axis=2), np.where(f.in_view, f.y_mm, -np.inf).max(axis=2)
+    return np.concatenate(ends).T
+
+
 def predict_scatter(p: SensorArrays, z_mm: np.ndarray, half_line_mm: np.ndarray, *, reflectance: float) -> np.ndarray:
     """Return the root mean square of sigma Z (K,) along the stripe of one design at ``z_mm`` (K,) from the stand-off.
 
     The stripe is evaluated up to ``half_line_mm`` (K,) on both sides, within the view.
     """
-    with np.errstate(all="ignore"):
-        pose = p.pose(np)
-        depth = standoff_mm(pose) - p.outer_mm(np) + pose.axis[2] * z_mm.reshape(1, -1, 1)
-        places = np.linspace(-1, 1, 2 * PLACES + 1).reshape(1, 1, -1) * (1 - 1e-9)
-        f = evaluate_field(np, p, depth, places, reflectance=reflectance)
+    f = evaluate_sheet(p, z_mm, places=2 * PLACES + 1, reflectance=reflectance)
     counts = f.in_view & (np.abs(f.y_mm) <= half_line_mm.reshape(1, -1, 1) + 1e-9)
     squares = np.where(counts, f.sigma_z_mm**2, 0.0)
     return np.sqrt(squares.sum(axis=2) / np.maximum(counts.sum(axis=2), 1))[0]

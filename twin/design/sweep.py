@@ -39,7 +39,6 @@ from twin.design.designs import (
     sample_designs,
 )
 from twin.design.study import Study, load_study
-from twin.design.study_page import page_text
 from twin.design.study_tables import failure_counts
 from twin.design.verification import Agreement, verify_candidates
 from twin.recording.campaigns import PLAN, keep_to_plan, make_folder, require_at_least
@@ -124,7 +123,7 @@ def write_csv(path: Path, columns: Columns) -> None:
 
 
 PARTS = "screen"
-_FREE_TO_CHANGE = ("verify", "verify_tolerance", "refine", "title")
+_FREE_TO_CHANGE = ("verify", "title")
 """Settings that can differ when a sweep is continued, as can the number of random, Sobol or optimised designs."""
 
 
@@ -394,6 +393,9 @@ def sweep(
                 described, folder / RENDERED, rendered, pool, variant=variant, progress=progress
             )
     result = SweepResult(described, folder, columns, marked, tuple(agreements), remarks)
+    # Its libraries of charts take seconds to import, which processes that evaluate designs do not need.
+    from twin.design.study_page import page_text
+
     page = page_text(described, columns, marked=marked, agreements=agreements, notes=remarks)
     write_page(folder / PAGE, page, overwrite=True)
     counts = dict(zip(("designs", "work", "meet_all_constraints"), result.counts(), strict=True))

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from scipy.stats import median_abs_deviation, norm
+from scipy import special
 
 from twin.design.designs import HighlightedDesign
 from twin.design.figures_of_merit import compute_figures, predict_scatter
@@ -43,6 +43,9 @@ _USER_ERROR = 2  # exit code of the commands for a mistake of the user
 _FEWEST_POINTS = 20  # of a profile, for its scatter to be known within a sixth
 _LARGEST_RESIDUAL = 5.0
 """Limit of residuals from the profile's trend in robust standard deviations; larger ones are outliers."""
+
+
+AGREES_WITHIN = 1.5  # largest factor between rendered and predicted scatter, see docs/results/designs.md
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +99,8 @@ def verify(
     ]
     start = time.perf_counter()
     run_jobs(partial(_record, folder, variant), jobs, workers=min(workers, len(jobs)))
-    steps = [] if planned.step is None else ["--step", str(_capture(folder, planned.step))]
-    target, capture = (str(_capture(folder, recording)) for recording in (planned.target, planned.standard))
+    steps = [] if planned.step is None else ["--step", str(_locate(folder, planned.step))]
+    target, capture = (str(_locate(folder, recording)) for recording in (planned.target, planned.standard))
     _run("calibrate", "--air", target, *steps, "--out", str(calibration), fails_as=errors.CalibrationError)
     known = ("--calibration", str(calibration), "--out", str(cloud))
     _run("reconstruct", capture, *known, fails_as=errors.CaptureError)
@@ -108,7 +111,7 @@ def verify(
     return replace(profiles, exposure_ms=exposure, seconds=time.perf_counter() - start)
 
 
-def _capture(folder: Path, recording: PlannedRecording) -> Path:
+def _locate(folder: Path, recording: PlannedRecording) -> Path:
     return folder / f"{recording.name}.h5"
 
 
@@ -118,7 +121,7 @@ def _record(
     """Render a recording to its file with one thread; several recordings are rendered at the same time."""
     recording, options = job
     try:
-        record_on_one_thread(recording.scene, recording.sensor, _capture(folder, recording), variant, options=options)
+        record_on_one_thread(recording.scene, recording.sensor, _locate(folder, recording), variant, options=options)
     except Error as error:
         raise type(error)(f"{recording.scene.title}: {error}") from error
 
@@ -161,7 +164,7 @@ def _measure_profile(points_yz: np.ndarray) -> tuple[float, float, float]:
         trend = np.polynomial.Polynomial.fit(y, z, 2)
         off = points_yz[:, 1] - trend(points_yz[:, 0])
         off -= np.median(off)
-        used = points_yz[np.abs(off) <= _LARGEST_RESIDUAL * median_abs_deviation(off, scale=float(norm.ppf(0.75)))]
+        used = points_yz[np.abs(off) <= _LARGEST_RESIDUAL * np.median(np.abs(off)) / special.ndtri(0.75)]
     y, z = used.T
     residuals = z - np.polynomial.Polynomial.fit(y, z, 2)(y)
     return float(np.sqrt(residuals @ residuals / (len(y) - 3))), float(z.mean()), float(np.ptp(y))
@@ -226,14 +229,12 @@ def compare_scatter(study: Study, candidate: HighlightedDesign, rendered: Verifi
     return Agreement(
         candidate.label,
         candidate.design.number,
-        z_mm=rendered.z_mm.tolist(),
         predicted_mm=predicted.tolist(),
         rendered_mm=rendered.scatter_mm.tolist(),
-        error_mm=rendered.error_mm.tolist(),
-        line_mm=rendered.line_mm.tolist(),
+        **{name: getattr(rendered, name).tolist() for name in ("z_mm", "error_mm", "line_mm")},
         ratio=factor,
         rendered_over_predicted=ratio,
-        agrees=bool(factor <= study.verify_tolerance),
+        agrees=bool(factor <= AGREES_WITHIN),
         exposure_ms=rendered.exposure_ms,
         predicted_exposure_ms=figures.exposure_ms.item(),
         seconds=rendered.seconds,
@@ -278,8 +279,6 @@ def verify_candidates(
         progress(len(known), len(candidates))
     # Label, number and tolerance can differ from those of the earlier run.
     return [
-        replace(
-            known[place], label=one.label, design=one.design.number, agrees=known[place].ratio <= study.verify_tolerance
-        )
+        replace(known[place], label=one.label, design=one.design.number, agrees=known[place].ratio <= AGREES_WITHIN)
         for place, one in enumerate(candidates)
     ]

@@ -36,35 +36,25 @@ _WITH_CHUNKS = 0x4000
 _MONO8 = 0x01080001
 # Chunk identifiers, defined by the camera.
 _IMAGE_CHUNK = 0x45430000
-ENCODER_CHUNK = 0x45430001
+_ENCODER_CHUNK = 0x45430001
 _CHUNK_BYTES = 3 * 8
 """Size of the encoder count, and of the identifiers and lengths of image and count, after an image."""
 
 
 def image_packets(
-    image: np.ndarray,
-    time_ns: int,
-    *,
-    number: int,
-    region: tuple[int, int, int, int],
-    packet_bytes: int,
-    count: int | None = None,
+    image: np.ndarray, time_ns: int, *, number: int, packet_bytes: int, count: int | None = None
 ) -> list[bytes]:
-    """Return the packets of an image (H, W), uint8: leader, payload of a region, and trailer.
+    """Return the packets of an image (H, W), uint8: leader, payload, and trailer.
 
-    ``number`` is that of the frame, 16 bits. ``region`` is left, top, width and height in px; pixels outside the image
-    are dark. ``packet_bytes`` is the size of a packet including all headers. ``count`` is that of the encoder, sent
-    after the image (GigE Vision 2.0, extended chunk mode).
+    ``number`` is that of the frame, 16 bits. ``packet_bytes`` is the size of a packet including all headers. ``count``
+    is that of the encoder, sent after the image (GigE Vision 2.0, extended chunk mode).
     """
-    x, y, width, height = region
-    seen = np.zeros((height, width), image.dtype)
-    part = image[y : y + height, x : x + width]
-    seen[: part.shape[0], : part.shape[1]] = part
-    pixels, room, kind = seen.tobytes(), packet_bytes - _OVERHEAD_BYTES, _IMAGE
+    height, width = image.shape
+    pixels, room, kind = image.tobytes(), packet_bytes - _OVERHEAD_BYTES, _IMAGE
     if count is not None:
         kind |= _WITH_CHUNKS
-        pixels += struct.pack(">IIqII", _IMAGE_CHUNK, len(pixels), count, ENCODER_CHUNK, 8)
-    leader = struct.pack(">HHQIIIIIHH", 0, kind, time_ns, _MONO8, width, height, x, y, 0, 0)
+        pixels += struct.pack(">IIqII", _IMAGE_CHUNK, len(pixels), count, _ENCODER_CHUNK, 8)
+    leader = struct.pack(">HHQIIIIIHH", 0, kind, time_ns, _MONO8, width, height, 0, 0, 0, 0)
     parts = [pixels[start : start + room] for start in range(0, len(pixels), room)]
     bodies = [(_LEADER, leader), *((_PAYLOAD, each) for each in parts), (_TRAILER, struct.pack(">II", kind, height))]
     return [struct.pack(">HHI", 0, number, kind << 24 | index) + body for index, (kind, body) in enumerate(bodies)]
@@ -108,12 +98,9 @@ class _Register:
 
     MAKER, MODEL, STREAM_PORT, PACKET_SIZE, STREAM_IP = 0x48, 0x68, 0xD00, 0xD04, 0xD18
     WIDTH, HEIGHT, SENSOR_HEIGHT, SENSOR_WIDTH = 0x100, 0x104, 0x118, 0x11C
-    ACQUISITION, OFFSET_X, OFFSET_Y = 0x124, 0x130, 0x134
-    TRIGGER_SOFTWARE, DEVICE_ID = 0x30C, 0xD8
+    ACQUISITION, TRIGGER_SOFTWARE, DEVICE_ID = 0x124, 0x30C, 0xD8
     CHUNKS, ENCODER_CHUNK = 0x1020, 0x1024
 
-
-_REGION = (_Register.OFFSET_X, _Register.OFFSET_Y, _Register.WIDTH, _Register.HEIGHT)
 
 _FUNCTIONS = {
     "arv_gv_fake_camera_new_full": (c_void_p, [c_char_p, c_char_p, c_char_p]),
@@ -161,6 +148,8 @@ class GigeCamera:
     ``frame(exposure_ms)`` returns the whole image (height_px, width_px), uint8; all calls are in the same thread. If it
     raises an exception, the frame is lost and the exception is kept in ``failure``. A trigger that arrives during the
     making of an image replaces the previous trigger, which is not answered.
+
+    Frames contain the whole image, also if a program sets a region.
 
     ``encoder`` returns the count of an encoder that is wired to the camera. It is sent as chunk data on request.
 
@@ -248,7 +237,7 @@ class GigeCamera:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as guard:
             guard.bind(("255.255.255.255", PORT))
             with tempfile.NamedTemporaryFile(suffix=".xml") as features:
-                features.write(self._features())
+                features.write(self._describe_features())
                 features.flush()
                 interface, name = LOOPBACK.encode(), features.name.encode()
                 self._server = library.arv_gv_fake_camera_new_full(interface, _SERIAL, name)
@@ -283,7 +272,7 @@ class GigeCamera:
         library.arv_fake_camera_set_trigger_frequency(self._camera, _LOOKS_FOR_TRIGGER_HZ)
         library.arv_fake_camera_set_fill_pattern(self._camera, self._callback, None)
 
-    def _features(self) -> bytes:
+    def _describe_features(self) -> bytes:
         """Return the XML of the camera's features: Aravis's fake camera, with those of an encoder if it has one."""
         library, size = self._library, c_size_t()
         usual = library.arv_fake_camera_new(_SERIAL)
@@ -333,14 +322,10 @@ class GigeCamera:
             dropped, shortened = self._apply_fault("drop"), self._apply_fault("cut")
             names = (_Register.STREAM_IP, _Register.STREAM_PORT, _Register.PACKET_SIZE)
             host, port, packet_bytes = map(self._read_register, names)
-            x, y, width, height = map(self._read_register, _REGION)
-            region = x, y, width, height
             counted = self._read_register(_Register.CHUNKS) and self._read_register(_Register.ENCODER_CHUNK)
         if not dropped:
             size, count = packet_bytes & 0xFFFF, shot.count if counted else None
-            packets = image_packets(
-                shot.image, shot.time_ns, number=self._number, region=region, packet_bytes=size, count=count
-            )
+            packets = image_packets(shot.image, shot.time_ns, number=self._number, packet_bytes=size, count=count)
             if shortened:
                 lost = range(_CUT_EVERY - 1, len(packets), _CUT_EVERY) or (len(packets) - 2,)
                 packets = [packet for index, packet in enumerate(packets) if index not in lost]

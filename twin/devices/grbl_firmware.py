@@ -147,7 +147,7 @@ class GrblFirmware:
         """Receive characters from the computer; they are lost during the start."""
         for byte in data if self._booted_s is None else b"":
             if byte == 0x18:
-                self._soft_reset()
+                self._reset_softly()
             elif byte == ord("?"):
                 if self._mode != "Home" and not self._critical:
                     self._send(self._report(self._now()))
@@ -179,7 +179,7 @@ class GrblFirmware:
         self._modal = {"motion": "G0", "distance": "G90", "units": "G21", "spindle": "M5"}
         self._feed_mm_min, self._s, self._offset_mm = 0.0, 0.0, 0.0
 
-    def _soft_reset(self) -> None:
+    def _reset_softly(self) -> None:
         now = self._now()
         self.axis.advance(now)
         if self._mode == "Home" or (self.axis.pending and (not self.axis.held or self.axis.braking(now))):

@@ -121,29 +121,29 @@ def plan_lines(
     for method in methods:
         made = method.calibration(folder)
         arguments = (*_give(folder, method.evidence), *shlex.split(method.options), "--out", made)
-        lines[made] = _line("calibrate", made, method.command, *arguments)
+        lines[made] = _plan("calibrate", made, method.command, *arguments)
     for method in methods:
         calibration = method.calibration(folder)
         if any(method.thesis.values()):
             made = method.result(folder, THESIS, "json")
-            lines[made] = _line("evaluate", made, "thesis", calibration, *_give(folder, method.thesis), "--out", made)
+            lines[made] = _plan("evaluate", made, "thesis", calibration, *_give(folder, method.thesis), "--out", made)
         for scan in method.scans:
             capture, cloud = folder / f"{scan}.h5", method.result(folder, scan, "cloud.h5")
             arguments = (capture, "--calibration", calibration, "--out", cloud, *shlex.split(method.detection))
-            lines[cloud] = _line("reconstruct", cloud, "reconstruct", *arguments)
+            lines[cloud] = _plan("reconstruct", cloud, "reconstruct", *arguments)
             if method.with_truth or takes[scan].scene.artefact is not None:
                 made = method.result(folder, scan, "evaluation.json")
                 compared = ["--truth", str(capture.with_suffix(".truth.h5"))] if method.with_truth else []
                 if method.with_truth and coloured and method is methods[0]:
                     compared += ["--coloured", str(method.result(folder, scan, COLOURED))]
-                lines[made] = _line("evaluate", made, "evaluate", cloud, "--out", made, *compared)
+                lines[made] = _plan("evaluate", made, "evaluate", cloud, "--out", made, *compared)
             if method.inspected and (kind := inspected_as(takes[scan].scene)) is not None:
                 made = method.result(folder, scan, "inspection.json")
-                lines[made] = _line("evaluate", made, "inspect", cloud, kind, "--out", made)
+                lines[made] = _plan("evaluate", made, "inspect", cloud, kind, "--out", made)
     return sorted(lines.values(), key=lambda line: ("calibrate", "reconstruct", "evaluate").index(line.stage))
 
 
-def _line(stage: str, writes: Path, *words: str | Path) -> CommandLine:
+def _plan(stage: str, writes: Path, *words: str | Path) -> CommandLine:
     """Return the command line of some words; it reads the paths among them that it does not write."""
     text = shlex.join(["uwlts", *map(str, words), "--overwrite"])
     return CommandLine(stage, text, tuple(one for one in words if isinstance(one, Path) and one != writes), writes)

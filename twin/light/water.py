@@ -154,17 +154,17 @@ class AngleTable:
 
     def share_below(self, one_minus_cosine: Float) -> Float:
         """Return the cumulative fraction of directions at the table's node at or below 1 - cos of an angle."""
-        return self._share(self._find_cell(dr.maximum(one_minus_cosine, FORWARD_END))[0])
+        return self._sum_share(self._find_cell(dr.maximum(one_minus_cosine, FORWARD_END))[0])
 
     def heights(self, u: Float) -> tuple[Float, Float]:
         """Return 1 - cos and 1 + cos of the angle below which the fraction ``u`` of directions is scattered."""
         node = mi.UInt32(0)
         step = NODES // 2
         while step:
-            node = dr.select(self._share(node + step) <= u, node + step, node)
+            node = dr.select(self._sum_share(node + step) <= u, node + step, node)
             step //= 2
         cell = dr.minimum(node, NODES - 2)
-        below, above = self._share(cell), self._share(cell + 1)
+        below, above = self._sum_share(cell), self._sum_share(cell + 1)
         share = dr.clip((u - below) / (above - below), 0.0, 1.0)
         low, high = self._gather_ends(cell)
         # The density exp(k t), 0 < t < 1, has the inverse log(1 + share (exp(k) - 1)) / k, undefined at k = 0. This is
@@ -174,7 +174,7 @@ class AngleTable:
         ratio = dr.exp(FIRST_PLACE + STEP * (mi.Float(cell) + t))
         before, after = 2 * ratio / (1 + ratio), 2 / (1 + ratio)
         # Beyond both ends of the table, directions are uniform over a cap.
-        first, last = (self._share(mi.UInt32(end)) for end in (0, NODES - 1))
+        first, last = (self._sum_share(mi.UInt32(end)) for end in (0, NODES - 1))
         forward, backward = u < first, u >= last
         before = dr.select(forward, FORWARD_END * u / first, before)
         after = dr.select(backward, BACKWARD_END * (1 - u) / (1 - last), after)
@@ -191,7 +191,7 @@ class AngleTable:
         place = self.start + cell
         return dr.gather(mi.Float, self.log_density, place), dr.gather(mi.Float, self.log_density, place + 1)
 
-    def _share(self, node: UInt32) -> Float:
+    def _sum_share(self, node: UInt32) -> Float:
         """Return the cumulative fraction of directions at a node."""
         return dr.gather(mi.Float, self.cumulative, self.start + node)
 

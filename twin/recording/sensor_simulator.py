@@ -35,7 +35,7 @@ from twin.sensor.detector import (
 )
 from twin.sensor.speckle import Speckle, coherence
 from uwlts.errors import DesignError
-from uwlts.model.placement import camera_from_object
+from uwlts.model.placement import apparent_depth_mm, camera_from_object
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Frame
 
@@ -200,7 +200,7 @@ class SensorSimulator:
 
     def electrons_per_ms(self, shot: Shot, *, spp: int, seed: int, travel: Travel | None = None) -> np.ndarray:
         """Return the mean photo-electrons per ms (H, W) of a shot."""
-        return self._electrons_per_ms(*self._render_light(shot, spp=spp, seed=seed, travel=travel), shot)
+        return self._compute_electrons_per_ms(*self._render_light(shot, spp=spp, seed=seed, travel=travel), shot)
 
     def _render_light(
         self,
@@ -226,7 +226,7 @@ class SensorSimulator:
         )
         return even, laser
 
-    def _electrons_per_ms(
+    def _compute_electrons_per_ms(
         self, even: np.ndarray, laser: LaserFrame | None, shot: Shot, *, speckle: bool = True
     ) -> np.ndarray:
         """Return mean photo-electrons per ms (H, W) of light from `_render_light`, with speckle if it is enabled."""
@@ -277,12 +277,12 @@ class SensorSimulator:
             seed=seed,
             travel=self.travel(shot),
             through_water=self.travel(shot, in_water=True),
-            time_s=self._time_s(shot, index),
+            time_s=self._find_time_s(shot, index),
             exposure_s=1e-3 * self._choose_exposure(shot),
             with_truth=True,
         )
 
-    def _time_s(self, shot: Shot, index: int) -> float:
+    def _find_time_s(self, shot: Shot, index: int) -> float:
         """Return the time of an image since the first of the scan."""
         return index * self.period_s if shot.time_s is None else shot.time_s
 
@@ -306,7 +306,7 @@ class SensorSimulator:
             stage_mm=shot.stage_mm,
             laser_on=shot.light == "laser",
             exposure_ms=self._choose_exposure(shot),
-            time_s=self._time_s(shot, index),
+            time_s=self._find_time_s(shot, index),
             pose=pose,
             pose_covariance=covariance,
             speed_mm_per_s=self.scene.motion.stage_speed_mm_s(),
@@ -318,7 +318,7 @@ class SensorSimulator:
 
     def _render_image(self, light: ShotLight, shot: Shot, index: int) -> np.ndarray:
         exposure_ms = self._choose_exposure(shot)
-        electrons = exposure_ms * self._electrons_per_ms(*light, shot)
+        electrons = exposure_ms * self._compute_electrons_per_ms(*light, shot)
         return self.detect(electrons, exposure_ms=exposure_ms, noise_seed=[self.options.seed, index])
 
     def expose(self, shot: Shot, index: int, *, exposure: float = 1.0, bright_share: float = 0.0) -> SimulatedImage:
@@ -327,7 +327,7 @@ class SensorSimulator:
         An automatic exposure is shortened until at most ``bright_share`` (if not 0) of pixels exceed ``auto_level``.
         """
         even, laser = self.light(shot, index)
-        per_ms, exposure_ms = self._electrons_per_ms(even, laser, shot), exposure * self._choose_exposure(shot)
+        per_ms, exposure_ms = self._compute_electrons_per_ms(even, laser, shot), exposure * self._choose_exposure(shot)
         if bright_share > 0 and self.sensor.exposure.described_ms(shot.light) == "auto":
             exposure_ms = min(exposure_ms, self._level_e / max(float(np.quantile(per_ms, 1 - bright_share)), 1e-9))
         nothing = np.zeros_like(even)
@@ -384,18 +384,14 @@ class SensorSimulator:
         """Displace the points of a target by its detection errors in this image."""
         for plate, pose in zip(self.scene.objects, self.scene.object_poses(), strict=True):
             if isinstance(plate, PrintedPlate) and plate.detection_std_px > 0:
-                seen = camera_from_object(self.sensor) @ np.linalg.inv(self.pose(shot)) @ pose
-                mm_per_px = self._compute_apparent_depth_mm(seen[2, 3]) / self.sensor.camera.focal_length_px()
+                depth_mm = (camera_from_object(self.sensor) @ np.linalg.inv(self.pose(shot)) @ pose)[2, 3]
+                window, wavelength = self.sensor.camera.window, self.sensor.laser.wavelength_nm
+                if window.mounted:
+                    indices = {"glass_index": window.index(wavelength)}
+                    indices["medium_index"] = self.medium.refractive_index(wavelength)
+                    depth_mm = apparent_depth_mm(depth_mm, window.distance_mm, window.thickness_mm, **indices)
+                mm_per_px = depth_mm / self.sensor.camera.focal_length_px()
                 shift_points(self.renderer.objects.scene, plate, mm_per_px=mm_per_px, image=index)
-
-    def _compute_apparent_depth_mm(self, depth_mm: float) -> float:
-        """Return the apparent depth of a point on the axis: a layer of index n appears n times thinner."""
-        window, wavelength = self.sensor.camera.window, self.sensor.laser.wavelength_nm
-        if not window.mounted:
-            return depth_mm
-        outside = depth_mm - window.distance_mm - window.thickness_mm
-        in_medium = outside / self.medium.refractive_index(wavelength)
-        return window.distance_mm + window.thickness_mm / window.index(wavelength) + in_medium
 
     def _find_exposure(self, light: Light, probe: Literal["scan", "middle"]) -> float:
         """Return the described exposure in ms, or that which brings the brightest shot to the wanted level."""
@@ -410,7 +406,7 @@ class SensorSimulator:
                 break
             even, laser = self._render_light(shot, spp=PROBE_SPP, seed=0, travel=None)
             # If one shot suffices, skip its speckle, which would double the time.
-            peaks = self._electrons_per_ms(even, laser, shot, speckle=probe == "scan").max(axis=axis)
+            peaks = self._compute_electrons_per_ms(even, laser, shot, speckle=probe == "scan").max(axis=axis)
             reference = np.sort(peaks)[-1 - min(STRAY_LINES, len(peaks) - 1)]
             lit = peaks[peaks > LIT_SHARE * reference]
             brightest = max(brightest, float(np.quantile(lit, BRIGHT_SHARE)) if len(lit) else 0.0)

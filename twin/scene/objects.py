@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
-from typing import Any, assert_never, cast
+from typing import TYPE_CHECKING, Any, assert_never, cast
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import trimesh
 
 from twin.backend.arrays import Bool, Float, Int32, SurfaceInteraction3f, UInt32, to_jit
 from twin.scene.description import AnyObject, Ball, Block, CirclePlate, Mesh, Pipe, Plate, Scene, TargetPlate
@@ -20,6 +19,9 @@ from twin.scene.scene_object import FreeForm
 from twin.scene.surfaces import GAUSSIANS, LateralSpread
 from uwlts.errors import DescriptionError
 from uwlts.files.reading import require_regular_file
+
+if TYPE_CHECKING:
+    import trimesh  # takes a second to import, and few scenes need it
 
 _MOST_MESH_BYTES = 2**28  # size of a binary STL file with five million triangles
 _FACING_SENSOR = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -233,12 +235,15 @@ def _triangulate(thing: AnyObject) -> tuple[np.ndarray, ...] | None:
             return bowed_plate(*thing.bounds_mm(), bow_mm=thing.bow_mm)
         case Block() if thing.edge_radius_mm > 0:
             return rounded_box(np.array(thing.size_mm), radius_mm=thing.edge_radius_mm)
-        case Block() if rough:
-            box = trimesh.creation.box(thing.size_mm)
-            return box.vertices, box.faces
-        case Ball() if rough:
-            ball = trimesh.creation.icosphere(subdivisions=5, radius=thing.diameter_mm / 2)
-            return ball.vertices, ball.faces
+        case Block() | Ball() if rough:
+            import trimesh
+
+            match thing:
+                case Ball():
+                    solid = trimesh.creation.icosphere(subdivisions=5, radius=thing.diameter_mm / 2)
+                case Block():
+                    solid = trimesh.creation.box(thing.size_mm)
+            return solid.vertices, solid.faces
         case Pipe() if rough:
             around = np.linspace(0, 2 * np.pi, 360, endpoint=False)
             return tube(np.array([-0.5, 0.5]) * thing.length_mm, around, np.full((2, 360), thing.diameter_mm / 2))
@@ -303,6 +308,8 @@ def _load_surface(thing: Mesh) -> tuple[np.ndarray, ...]:
 
     Parts are concatenated here: trimesh would also copy their materials, which requires an imaging library.
     """
+    import trimesh
+
     path = thing.path
     require_regular_file(path, most_bytes=_MOST_MESH_BYTES, error=DescriptionError, called="mesh")
     try:

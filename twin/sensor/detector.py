@@ -14,7 +14,6 @@ from typing import cast
 
 import cv2
 import numpy as np
-from scipy.signal import fftconvolve
 
 from twin.rendering_options import Flaws
 from twin.sensor.random_numbers import add_normal_numbers, poisson_numbers
@@ -280,9 +279,8 @@ def dirt(camera: Camera, share: float, *, seed: int) -> np.ndarray:
     """
     inner = camera.window.distance_mm
     px_per_mm = camera.focal_length_px() / inner
-    focus = camera.focus_distance_mm
-    working = camera.f_number * (1 + camera.focal_length_mm / (focus - camera.focal_length_mm))
-    blur_px = 0.5 * camera.focal_length_mm / working * (1 - inner / focus) * px_per_mm
+    pupil_mm = 0.5 * camera.focal_length_mm / camera.working_f_number()
+    blur_px = pupil_mm * (1 - inner / camera.focus_distance_mm) * px_per_mm
     largest_px = 0.5 * _SPOT_MM[1] * px_per_mm
     margin = math.ceil(blur_px + largest_px)
     # The radius of the smallest spot spans at least `_CELLS_PER_SPOT` cells.
@@ -308,7 +306,7 @@ def dirt(camera: Camera, share: float, *, seed: int) -> np.ndarray:
     free = cv2.resize(free, (width, height), interpolation=cv2.INTER_AREA)
     reach = np.arange(-math.ceil(blur_px), math.ceil(blur_px) + 1)
     disc = (np.hypot(reach[:, None], reach) <= max(blur_px, 0.5)).astype(np.float32)
-    free = fftconvolve(free, disc / disc.sum(), mode="same").astype(np.float32)
+    free = _convolve(free, disc / disc.sum())
     return np.clip(free[margin : margin + camera.height_px, margin : margin + camera.width_px], 0, 1)
 
 
@@ -326,9 +324,17 @@ def add_glare(light: np.ndarray, share: float) -> np.ndarray:
     y, x = np.ogrid[1 - rows : rows, 1 - columns : columns]
     cell_per_reach = cell / (GLARE_REACH * width)
     kernel = np.exp(-np.hypot(x, y) * cell_per_reach) * cell_per_reach**2 / (2 * math.pi)
-    veil = np.maximum(fftconvolve(coarse, kernel, mode="same"), 0).astype(np.float32)
+    veil = np.maximum(_convolve(coarse, kernel), 0)
     veil = cv2.resize(veil, padded.shape[::-1], interpolation=cv2.INTER_LINEAR)[:height, :width]
     return np.float32(1 - share) * light + np.float32(share) * veil
+
+
+def _convolve(light: np.ndarray, kernel: np.ndarray) -> np.ndarray:
+    """Return light (H, W), float32, convolved with a kernel and dark beyond its border."""
+    # Takes a second to import, which images without this light do not need.
+    from scipy.signal import fftconvolve
+
+    return fftconvolve(light, kernel, mode="same").astype(np.float32)
 
 
 def add_ghost(light: np.ndarray, camera: Camera, share: float) -> np.ndarray:

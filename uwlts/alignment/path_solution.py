@@ -181,15 +181,15 @@ def initial_estimate(survey: Survey, prior: PathPrior, options: AlignmentOptions
 def solve(estimate: PathEstimate) -> PathEstimate:
     """Iterate the least-squares steps until they are negligible."""
     for _ in range(estimate.options.rounds):
-        before, estimate = estimate.numbers, _solve_step(estimate, *_normal_equations(estimate))
-        if _step_size(estimate, before) < estimate.options.still:
+        before, estimate = estimate.numbers, _solve_step(estimate, *_sum_normal_equations(estimate))
+        if _measure_step(estimate, before) < estimate.options.still:
             break
     return estimate
 
 
 def bring_together(estimate: PathEstimate, hypothesis: Hypothesis) -> PathEstimate:
     """Move the path by a hypothesis, so that the surfaces of its pair match, and add the pair."""
-    by, (normal, right) = estimate.relative_movement(hypothesis.pair, hypothesis.at_mm), _normal_equations(estimate)
+    by, (normal, right) = estimate.relative_movement(hypothesis.pair, hypothesis.at_mm), _sum_normal_equations(estimate)
     weighted = by.T / hypothesis.std**2
     moved = _solve_step(estimate, normal + weighted @ by, right + weighted @ hypothesis.relative[:, None])
     return replace(moved, pairs=(*moved.pairs, hypothesis.pair))
@@ -246,7 +246,7 @@ def settle(estimate: PathEstimate) -> PathEstimate:
             drift, estimate = estimate.prior.drift, select_drift(estimate)
             selected = estimate.prior.drift is drift
         before, estimate = estimate.numbers, solve(refit(estimate, crossing))
-        if selected and _step_size(estimate, before) < estimate.options.settled:
+        if selected and _measure_step(estimate, before) < estimate.options.settled:
             break
     agreeing = tuple(pair for pair in estimate.pairs if estimate.agrees(pair))
     return estimate if len(agreeing) == len(estimate.pairs) else settle(replace(estimate, pairs=agreeing))
@@ -263,7 +263,7 @@ def select_drift(estimate: PathEstimate, *, walk_only: bool = False) -> PathEsti
     prior, drift = estimate.prior, estimate.prior.drift
     if drift.stated or not estimate.pairs:
         return estimate
-    normal, right = _normal_equations(estimate)
+    normal, right = _sum_normal_equations(estimate)
     near = np.flatnonzero(normal.any(axis=0))
     if not len(near):
         return estimate
@@ -319,7 +319,7 @@ def _change_prior(estimate: PathEstimate, prior: PathPrior) -> PathEstimate:
     return replace(estimate, prior=prior, values=values, numbers=zeros, factor=np.eye(len(zeros)))
 
 
-def _step_size(estimate: PathEstimate, before: np.ndarray) -> float:
+def _measure_step(estimate: PathEstimate, before: np.ndarray) -> float:
     """Return the rms step from earlier whitened coordinates (6 C,), in standard deviations of the estimate."""
     return float(np.sqrt(np.mean((estimate.factor.T @ (estimate.numbers - before)) ** 2)))
 
@@ -332,7 +332,7 @@ def _solve_step(estimate: PathEstimate, normal: np.ndarray, right: np.ndarray) -
     return replace(estimate, values=prior.times_root(numbers)[:, 0], numbers=numbers[:, 0], factor=factor)
 
 
-def _normal_equations(estimate: PathEstimate) -> tuple[np.ndarray, np.ndarray]:
+def _sum_normal_equations(estimate: PathEstimate) -> tuple[np.ndarray, np.ndarray]:
     """Return the normal matrix (6 C, 6 C) and right-hand side (6 C, 1) of the values from all pairs, without prior."""
     count = len(estimate.values)
     parts = [part for pair in estimate.pairs for part in _linearise_pair(estimate, pair)]

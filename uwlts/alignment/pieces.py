@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy import special
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from uwlts.errors import EvaluationError
 from uwlts.fitting.patches import Patches, find_disc_radius, surface_patches
@@ -76,7 +76,7 @@ class AlignmentOptions:
     @property
     def gate(self) -> float:
         """Squared Mahalanobis distance in six dimensions with the same probability as ``search_sigmas`` in one."""
-        return float(chi2.ppf(chi2.cdf(self.search_sigmas**2, 1), 6))
+        return float(special.chdtri(6, special.chdtrc(1, self.search_sigmas**2)))
 
 
 _FEWEST_POINTS = 200  # least number of points of a piece with patches
@@ -203,12 +203,12 @@ def fit_piece(
     places = turned_back.apply(patches.places_mm - platform - corrections[image, :3]) + platform
     cubes = np.floor(places / (options.held_out_cube * survey.radius_mm)).astype(np.int64)
     held_out = (cubes @ np.array([1, 2, 3])) % options.held_out_every == 0
-    slopes = _time_gradients(places, times, 2 * survey.radius_mm)
+    slopes = _fit_time_gradients(places, times, 2 * survey.radius_mm)
     piece = Piece(part, patches, np.empty(0), places, times, slopes, platform, survey.velocity_mm_s[image], held_out)
     return replace(piece, back=np.linalg.inv(piece.around(corrections[image], rates[image])))
 
 
-def _time_gradients(places: np.ndarray, times: np.ndarray, reach_mm: float) -> np.ndarray:
+def _fit_time_gradients(places: np.ndarray, times: np.ndarray, reach_mm: float) -> np.ndarray:
     """Return the gradients (P, 3), s/mm, of times (P,) over places (P, 3), from their neighbours."""
     pairs = KDTree(places).query_pairs(reach_mm, output_type="ndarray")
     first, second = np.vstack([pairs, pairs[:, ::-1]]).T

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.stats import t
+from scipy import special
 
 from uwlts.fitting.least_squares import DEFAULT_K, MAD_TO_STD
 from uwlts.stripe import Stripe, StripeOptions, StripeStatus, extract_stripe
@@ -209,7 +209,7 @@ def find_step(places: np.ndarray, distances: np.ndarray) -> tuple[int, float] | 
     jumps = steps.T @ left / squares
     share = jumps**2 * squares / np.maximum(np.sum(left**2, axis=0), np.finfo(float).tiny)
     best = int(np.argmax(share.max(axis=1)))
-    least = t.isf(_FALSE_ALARM / (2 * share.size), count - 4) ** 2
+    least = special.stdtrit(count - 4, _FALSE_ALARM / (2 * share.size)) ** 2
     if share[best].max() < max(_LEAST_SHARE, least / (least + count - 4)):
         return None
     return int(moments[best]), float(abs(jumps[best, 0]) + abs(jumps[best, 1]) / 2)

@@ -236,7 +236,7 @@ def inspect(
 
 
 @command_from(app, uwlts.report, "write_findings", job="Inspect", also=_INSPECTIONS)
-def findings_report(call: Call, *, section_mm=None, wall_mm=None, false_alarm=None, largest_ovality=None) -> None:
+def findings_report(call: Call, *, wall_mm=None, false_alarm=None, largest_ovality=None) -> None:
     """Example: uwlts findings-report pipe.cloud.h5 --wall-mm 9.5 --calibration water.json --out pipe.html --pdf"""
     from uwlts.pages.toolkit import json_beside
 

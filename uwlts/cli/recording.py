@@ -1,4 +1,4 @@
-"""Commands at the sensor (scan, watch, desk, ROS node, doctor), and about sensors and files."""
+"""Commands at the sensor (scan, desk, ROS node, doctor), and about sensors and files."""
 
 import sys
 from pathlib import Path
@@ -16,12 +16,6 @@ def scan(call: Call) -> None:
     exposures = ", ".join(f"{light} {value:.3g} ms" for light, value in seen.exposure_ms.items())
     lines = f"{seen.found} of {seen.lines} profile lines with a stripe"
     say(f"wrote {call.given['out']}, {lines}; exposure {exposures or 'as before'}")
-
-
-@command_from(app, uwlts.desk, "watch", job="Scan")
-def watch(call: Call) -> None:
-    """Example: uwlts watch scan.h5 --calibration calibration.json"""
-    call()
 
 
 @command_from(app, uwlts.desk, "serve_desk", job="Scan")

@@ -8,8 +8,8 @@ from itertools import chain, pairwise
 from typing import NamedTuple
 
 import numpy as np
+from scipy import special
 from scipy.spatial import KDTree
-from scipy.stats import t as t_distribution
 
 from uwlts.registration.surface_registration import SurfaceSample
 from uwlts.storage.cloud import PointUncertainty, project_variance
@@ -112,7 +112,7 @@ def average_locally(
 def _compute_student_ratio(number: np.ndarray) -> np.ndarray:
     """Return the ratio (P,) of Student's quantile to the normal one for numbers of points (P,)."""
     table = np.ones(_NEARLY_NORMAL + 1)
-    table[2:_NEARLY_NORMAL] = t_distribution.ppf(0.975, np.arange(1, _NEARLY_NORMAL - 1)) / TWO_SIDED
+    table[2:_NEARLY_NORMAL] = special.stdtrit(np.arange(1, _NEARLY_NORMAL - 1), 0.975) / TWO_SIDED
     return table[np.minimum(number, _NEARLY_NORMAL)]
 
 

@@ -1,4 +1,4 @@
-"""Pages and nodes beside the sensor: the operator's desk, guided calibration, a followed recording, and ROS 2.
+"""Pages and nodes beside the sensor: the operator's desk, guided calibration, and ROS 2.
 
 The stub beside this file lists the functions. Each is imported when it is first used.
 """

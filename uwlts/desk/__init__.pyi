@@ -1,4 +1,3 @@
 from .guided import record_guided as record_guided
 from .operator_page import serve_desk as serve_desk
-from .recording_view import watch as watch
 from .scan import serve_ros as serve_ros

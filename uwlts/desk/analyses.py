@@ -200,15 +200,13 @@ _COMPARED = ("cloud", "reference", "register", "same_water", "cloud_std_mm", "re
 _CLOUD = ".cloud.h5"
 """Ending of clouds to measure, with the whole uncertainty."""
 _INSPECTED = (".html", ".findings.json", "-coloured.ply")
-_OPTIONS = {"pipe": "wall_mm", "weld": "section_mm"}
+_FIELDS = {"pipe": ("cloud", "wall_mm"), "weld": ("cloud",)}
 ANALYSES: Mapping[str, Analysis] = MappingProxyType(
     {
         "reconstruct": Analysis(_reconstruct, ((uwlts, "reconstruct", ("capture", "calibration")),), "", (_CLOUD,)),
         **{
-            f"inspect {kind}": Analysis(
-                _inspect, ((uwlts, f"inspect_{kind}", ("cloud", option)), _REPORT), f"-{kind}", _INSPECTED
-            )
-            for kind, option in _OPTIONS.items()
+            f"inspect {kind}": Analysis(_inspect, ((uwlts, f"inspect_{kind}", given), _REPORT), f"-{kind}", _INSPECTED)
+            for kind, given in _FIELDS.items()
         },
         "compare": Analysis(
             _compare,

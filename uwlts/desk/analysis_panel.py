@@ -72,10 +72,10 @@ class AnalysisPanel:
 
     def _suggest_name(self) -> None:
         """Show the name that is used if none is given."""
-        self._name.props["placeholder"] = name_results(str(self._kind.value), self._given())
+        self._name.props["placeholder"] = name_results(str(self._kind.value), self._read())
         self._name.update()
 
-    def _given(self) -> dict[str, Any]:
+    def _read(self) -> dict[str, Any]:
         return {name: made.value for name, (_, made) in self._fields.items()}
 
     def set_files(self) -> None:
@@ -83,14 +83,14 @@ class AnalysisPanel:
         files = _list_files_by_kind(self._folder)
         for each, made in self._fields.values():
             if each.file_kind:
-                options = _options(each, files)
+                options = _offer(each, files)
                 # Choices that have disappeared are dropped.
                 kept = [one for one in made.value if one in options] if isinstance(made.value, list) else made.value
                 made.set_options(options, value=kept if kept in options or isinstance(kept, list) else None)
 
     def _begin(self) -> None:
         overwrite = bool(self._replace.value)
-        self._analyses.start(str(self._kind.value), self._given(), name=self._name.value or "", overwrite=overwrite)
+        self._analyses.start(str(self._kind.value), self._read(), name=self._name.value or "", overwrite=overwrite)
 
     def refresh(self) -> None:
         """Show the state of the latest analysis."""
@@ -136,7 +136,7 @@ class AnalysisPanel:
 def _make_field(each: AnalysisField, files: dict[str, list[str]]) -> Any:
     """Return a new element for a field: a choice, a switch or a number."""
     if each.file_kind or each.choices:
-        made = ui.select(_options(each, files), label=each.label, clearable=not each.required, multiple=each.several)
+        made = ui.select(_offer(each, files), label=each.label, clearable=not each.required, multiple=each.several)
         return made.props("dense use-chips" if each.several else "dense")
     return ui.checkbox(each.label) if each.switch else NumberField(each.label).props("dense")
 
@@ -154,5 +154,5 @@ def _list_files_by_kind(folder: Path) -> dict[str, list[str]]:
     return found | {"description": orders}
 
 
-def _options(each: AnalysisField, files: dict[str, list[str]]) -> list[str]:
+def _offer(each: AnalysisField, files: dict[str, list[str]]) -> list[str]:
     return [*files.get(each.file_kind, []), *each.choices]

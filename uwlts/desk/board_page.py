@@ -108,7 +108,7 @@ class BoardView:
             self._pictures = board.pictures
             self._image.props(f'src="picture.jpg?{self._pictures}"').set_visibility(True)
             self._caption.set_text(picture.caption)
-            self._histogram.set_content(_histogram(picture))
+            self._histogram.set_content(_draw_histogram(picture))
         if board.coverage is not None and board.coverage is not self._coverage:
             self._coverage = board.coverage
             if self._map is not None:
@@ -144,7 +144,7 @@ def _describe_progress(board: Board) -> str:
     return text if place is None else f"{text} · stage at {place:.3f} mm"
 
 
-def _histogram(picture: Picture) -> str:
+def _draw_histogram(picture: Picture) -> str:
     """Return bars of the grey values as HTML, on a logarithmic scale from 1e-5 of all pixels."""
     heights = np.clip(1 + np.log10(np.maximum(picture.histogram, 1e-5)) / 5, 0.0, 1.0)
     bars = "".join(

@@ -249,9 +249,9 @@ class TargetPhase:
         """
         self._session = session
         self._show_state(state)
-        return self._free(state) if self._plan.poses == "free" else self._by_stage(state)
+        return self._record_by_hand(state) if self._plan.poses == "free" else self._record_by_stage(state)
 
-    def _by_stage(self, state: State) -> State:
+    def _record_by_stage(self, state: State) -> State:
         places = self._plan.places_left(state.recorded)
         for number, place in enumerate(places):
             self._session.screen.request(f"the stage goes to {place:.2f} mm, {len(places) - number} positions left")
@@ -270,7 +270,7 @@ class TargetPhase:
                     break
         return state
 
-    def _free(self, state: State) -> State:
+    def _record_by_hand(self, state: State) -> State:
         advice: Forecast | None = None
         refused: list[TargetView] = []
         still: TargetView | None = None

@@ -11,7 +11,7 @@ import numpy as np
 
 from uwlts.calibration.guidance import Coverage
 from uwlts.desk.laser_switch import LaserSwitch
-from uwlts.desk.shown_state import Board, Picture
+from uwlts.desk.shown_state import Board, Ended, Picture
 from uwlts.errors import HardwareError
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.rig import LaserStage
@@ -21,10 +21,6 @@ ANSWERS = ("take", "skip", "done")
 """Take the target as it is now; ask for another pose; end this phase with what is recorded."""
 _COVERED, _EMPTY, _DOT = (70, 140, 70), (120, 60, 60), (230, 230, 230)
 _MAP_CELL_PX = 48  # size of a cell of the map on the screen
-
-
-class Ended(Exception):
-    """Raised when the operator has ended the recording."""
 
 
 class BoardScreen:

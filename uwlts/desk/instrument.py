@@ -22,10 +22,10 @@ import numpy as np
 from uwlts.calibration.calibrate import calibrate
 from uwlts.desk.guided import guide
 from uwlts.desk.guided_plan import GuidedPlan
-from uwlts.desk.guided_screen import BoardScreen, Ended, darken
+from uwlts.desk.guided_screen import BoardScreen, darken
 from uwlts.desk.laser_switch import LaserSwitch
 from uwlts.desk.recording_view import BackgroundView, RecordingView
-from uwlts.desk.shown_state import Board, FrameProfile, Picture
+from uwlts.desk.shown_state import Board, Ended, FrameProfile, Picture
 from uwlts.errors import DescriptionError, Error, HardwareError
 from uwlts.hardware.camera_interface import CameraDevice, GrabbedFrame
 from uwlts.hardware.continuous import ScanListeners
@@ -172,7 +172,7 @@ class Instrument:
                 # Live images are shown when no other task waits.
                 work = self._work.get(timeout=_PREVIEW_S)
             except queue.Empty:
-                work = self._preview
+                work = self._show_preview
             self._do(work)
         self._do(self.disconnect)
 
@@ -276,7 +276,7 @@ class Instrument:
                 self._board.say(str(error), "warning")
             self._board.say("disconnected")
 
-    def _stage(self) -> GrblStage:
+    def _require_stage(self) -> GrblStage:
         if (stage := self._grbl) is None:
             raise HardwareError("no stage is connected")
         return stage
@@ -290,7 +290,7 @@ class Instrument:
 
     def _run_move(self, phase: str, work: Callable[[GrblStage], float]) -> None:
         self._begin(phase)
-        stage, self._rig = self._stage(), None
+        stage, self._rig = self._require_stage(), None
         self._stop.clear()
         self._board.position_mm = work(stage)
         self._board.say(f"{phase} done: the stage is at {self._board.position_mm:.3f} mm")
@@ -306,13 +306,13 @@ class Instrument:
     def move(self, position_mm: float) -> None:
         """Move the stage to a position."""
         connected = self._begin(f"moving to {position_mm:.3f} mm")
-        self._stage()
+        self._require_stage()
         self._board.position_mm = self._prepare_rig(connected).move_to(position_mm)
 
     def jog(self, by_mm: float) -> None:
         """Move the stage by some mm."""
         self._begin("moving")
-        stage = self._stage()
+        stage = self._require_stage()
         low, high = stage.limits_mm
         self.move(float(np.clip(stage.position_mm() + by_mm, low, high)))
 
@@ -337,7 +337,7 @@ class Instrument:
         self.exposure_ms[light] = found
         self._board.say(f"{light}: exposed by {found:.4g} ms")
 
-    def _preview(self) -> None:
+    def _show_preview(self) -> None:
         connected, light = self._connected, self.light
         if light == "laser" and not self._switches_laser():
             # A fault, or Laser off, has locked the stage.
@@ -395,7 +395,7 @@ class Instrument:
         """
         known: AnyCalibration | None = None if calibration is None else load_calibration(calibration)
         connected, board = self._begin("beginning the scan"), self._board
-        stage = self._stage()
+        stage = self._require_stage()
         self._stop.clear()
         self._paused.clear()
         view = RecordingView(board, plan.header(out.stem), known, name=out.name)

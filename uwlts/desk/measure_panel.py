@@ -70,25 +70,25 @@ class Plot:
 
     def draw(self) -> str:
         """Return the plot as the content of an SVG element of 360 x 220 px."""
-        x = _scale(*self.across_range, _LEFT, _WIDTH - _RIGHT)
+        x = _make_scale(*self.across_range, _LEFT, _WIDTH - _RIGHT)
         ends = (_TOP, _HEIGHT - _BOTTOM) if self.downwards else (_HEIGHT - _BOTTOM, _TOP)
         # The axis of bars begins at zero.
         up_range = _widen(float(self.up.min()), float(self.up.max()))
         if self.bar_width is not None:
             up_range = 0.0, max(1.0, (1 + _MARGIN) * float(self.up.max()))
-        y = _scale(*up_range, *ends)
+        y = _make_scale(*up_range, *ends)
         parts = [f'<rect width="{_WIDTH}" height="{_HEIGHT}" fill="white"/>']
         for value, text in ticks(*self.across_range):
             at = x(value)
             parts.append(_draw_line(at, _TOP, at, _HEIGHT - _BOTTOM, "#dde2e8"))
-            parts.append(_text(at, _HEIGHT - _BOTTOM + 13, text, "middle"))
+            parts.append(_write(at, _HEIGHT - _BOTTOM + 13, text, "middle"))
         for value, text in ticks(*up_range):
             at = y(value)
             parts.append(_draw_line(_LEFT, at, _WIDTH - _RIGHT, at, "#dde2e8"))
-            parts.append(_text(_LEFT - 4, at + 4, text, "end"))
-        parts.append(_text((_LEFT + _WIDTH - _RIGHT) / 2, _HEIGHT - 6, self.across_label, "middle"))
+            parts.append(_write(_LEFT - 4, at + 4, text, "end"))
+        parts.append(_write((_LEFT + _WIDTH - _RIGHT) / 2, _HEIGHT - 6, self.across_label, "middle"))
         middle = (_TOP + _HEIGHT - _BOTTOM) / 2
-        parts.append(f'<g transform="rotate(-90 11 {middle:.1f})">{_text(11, middle, self.up_label, "middle")}</g>')
+        parts.append(f'<g transform="rotate(-90 11 {middle:.1f})">{_write(11, middle, self.up_label, "middle")}</g>')
         every = slice(None, None, 1 if self.bar_width else -(-len(self.across) // _MOST_POINTS))
         u, v = x(self.across[every]), y(self.up[every])
         if self.bar_width is None:
@@ -124,7 +124,7 @@ def _widen(low: float, high: float) -> tuple[float, float]:
     return low - margin, high + margin
 
 
-def _scale(low: float, high: float, first: float, last: float):
+def _make_scale(low: float, high: float, first: float, last: float):
     def pixel(value):
         return first + (value - low) / (high - low) * (last - first)
 
@@ -135,7 +135,7 @@ def _draw_line(x: float, y: float, to_x: float, to_y: float, colour: str) -> str
     return f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{to_x:.1f}" y2="{to_y:.1f}" stroke="{colour}"/>'
 
 
-def _text(x: float, y: float, text: str, anchor: str) -> str:
+def _write(x: float, y: float, text: str, anchor: str) -> str:
     style = 'font-size="11" font-family="sans-serif" fill="#2b3440"'
     return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" {style}>{escape(text)}</text>'
 
@@ -198,7 +198,7 @@ class MeasurePanel:
         with ui.element("div").classes("fields"):
             self._radius = NumberField("radius about the point, mm", value=_DEFAULT_RADIUS_MM, min=0.01)
             for shape in get_args(Shape):
-                self._button(shape, partial(self._shape, shape)).props("outline dense")
+                self._button(shape, partial(self._fit_shape, shape)).props("outline dense")
         with ui.element("div").classes("fields"):
             self._width = NumberField("width, mm", value=_DEFAULT_WIDTH_MM, min=0.001)
             self._field = ui.select(["Z", "intensity", "deviation"], value="Z", label="field")
@@ -267,7 +267,7 @@ class MeasurePanel:
         found = measure_length(cloud, find_nearest_point(cloud, first), find_nearest_point(cloud, second))
         self._add(found, self._board.cloud_name, without)
 
-    async def _shape(self, shape: Shape) -> None:
+    async def _fit_shape(self, shape: Shape) -> None:
         picked, (cloud, without) = self._measuring.picked, self._choose_cloud()
         if not picked:
             raise DescriptionError("click a point in the cloud first")

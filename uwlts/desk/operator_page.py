@@ -194,8 +194,8 @@ class _OperatorPage:
         self._desk, self._instrument, self._board = desk, desk.instrument, desk.board
         self._view = BoardView(desk.board, picked=lambda place: self._measure.show_picked(place))
         self._only: list[tuple[DisableableElement, tuple[InstrumentState, ...]]] = []
-        self._analyses = AnalysisPanel(desk.folder, desk.analyses, button=self._button, mark=self._view.mark)
-        self._measure = MeasurePanel(desk.folder, desk.board, desk.measuring, button=self._button, mark=self._view.mark)
+        self._analyses = AnalysisPanel(desk.folder, desk.analyses, button=self._offer, mark=self._view.mark)
+        self._measure = MeasurePanel(desk.folder, desk.board, desk.measuring, button=self._offer, mark=self._view.mark)
         self._refreshed = 0
         self._files: tuple[object, ...] = ()
 
@@ -227,7 +227,7 @@ class _OperatorPage:
         update_regularly(self._refresh)
         ui.timer(_LIST_S, self._update_list)
 
-    def _button(
+    def _offer(
         self, label: str, press: Callable[[], object], states: tuple[InstrumentState, ...] | None = None
     ) -> ui.button:
         """Add a button whose errors are shown, and which is enabled in some states only."""
@@ -277,8 +277,8 @@ class _OperatorPage:
         self._camera = ui.input("camera", value=camera, placeholder=kinds).classes("w-full")
         self._stage = ui.input("stage", value=stage, placeholder="/dev/ttyACM0; empty: none").classes("w-full")
         with ui.row():
-            self._button("connect", self._connect, (InstrumentState.DISCONNECTED, *_FREE))
-            self._button("disconnect", partial(ask, device.disconnect), _FREE).props("outline")
+            self._offer("connect", self._connect, (InstrumentState.DISCONNECTED, *_FREE))
+            self._offer("disconnect", partial(ask, device.disconnect), _FREE).props("outline")
         ui.separator()
         ui.label("live image").classes("text-sm")
         self._light = ui.toggle({"lamp": "lamp", "laser": "laser", "none": "stop"}, value="none")
@@ -288,7 +288,7 @@ class _OperatorPage:
         with ui.element("div").classes("fields"):
             self._exposure = NumberField("exposure, ms", value=self._exposed[1], min=0.001, step=0.1, format="%.3g")
             self._exposure.on("change", self._expose)
-            self._button("find exposure", partial(ask, device.find_exposure), (InstrumentState.READY,)).props("outline")
+            self._offer("find exposure", partial(ask, device.find_exposure), (InstrumentState.READY,)).props("outline")
         ui.label("The laser is on only while an image is exposed.").classes("text-xs")
 
     def _choose(self) -> None:
@@ -333,18 +333,18 @@ class _OperatorPage:
     def _show_stage_part(self) -> None:
         device, ask = self._instrument, self._instrument.ask
         with ui.row():
-            self._button("home", partial(ask, device.home), _FREE)
-            self._button("unlock", partial(ask, device.unlock), _FREE).props("outline")
+            self._offer("home", partial(ask, device.home), _FREE)
+            self._offer("unlock", partial(ask, device.unlock), _FREE).props("outline")
         ui.label("Unlock only where nothing moved since the position was known.").classes("text-xs")
         with ui.row().classes("gap-1"):
             for by in _JOGS_MM:
                 label = f"{by:+g}".replace("-", "−")
-                self._button(label, partial(ask, partial(device.jog, by)), (InstrumentState.READY,)).props(
+                self._offer(label, partial(ask, partial(device.jog, by)), (InstrumentState.READY,)).props(
                     f'outline dense aria-label="move by {by:+g} mm"'
                 )
         with ui.row().classes("items-center"):
             place = NumberField("position, mm", value=0.0, format="%.3f")
-            self._button("move", lambda: ask(device.move, float(place.value or 0.0)), (InstrumentState.READY,))
+            self._offer("move", lambda: ask(device.move, float(place.value or 0.0)), (InstrumentState.READY,))
 
     # Calibrate
 
@@ -356,12 +356,12 @@ class _OperatorPage:
             self._calibration_name = ui.input("name of the calibration", value="calibration")
             self._replace = ui.checkbox("replace existing")
         with ui.row():
-            self._button("begin", lambda: self._calibrate(resume=False), (InstrumentState.DISCONNECTED, *_FREE))
-            self._button(
+            self._offer("begin", lambda: self._calibrate(resume=False), (InstrumentState.DISCONNECTED, *_FREE))
+            self._offer(
                 "continue it", lambda: self._calibrate(resume=True), (InstrumentState.DISCONNECTED, *_FREE)
             ).props("outline")
         self._show_request = answer_buttons(self._board, self._instrument.answer)
-        self._button("stop", self._instrument.stop, (InstrumentState.BUSY,)).props("color=warning")
+        self._offer("stop", self._instrument.stop, (InstrumentState.BUSY,)).props("color=warning")
         self._view.coverage()
 
     def _calibrate(self, *, resume: bool) -> None:
@@ -394,14 +394,14 @@ class _OperatorPage:
             self._out = ui.input("name of the capture", value="scan")
             self._overwrite = ui.checkbox("replace existing")
         with ui.row():
-            self._button("start", lambda: self._record(resume=False), (InstrumentState.READY,))
-            self._button("continue interrupted", lambda: self._record(resume=True), (InstrumentState.READY,)).props(
+            self._offer("start", lambda: self._record(resume=False), (InstrumentState.READY,))
+            self._offer("continue interrupted", lambda: self._record(resume=True), (InstrumentState.READY,)).props(
                 "outline"
             )
         with ui.row():
-            self._button("pause", self._instrument.pause, (InstrumentState.SCANNING,))
-            self._button("resume", self._instrument.resume, (InstrumentState.PAUSED,))
-            self._button("stop", self._instrument.stop, _RUNNING).props("color=warning")
+            self._offer("pause", self._instrument.pause, (InstrumentState.SCANNING,))
+            self._offer("resume", self._instrument.resume, (InstrumentState.PAUSED,))
+            self._offer("stop", self._instrument.stop, _RUNNING).props("color=warning")
 
     def _use_calibration(self, name: str | None) -> None:
         """Use a calibration for the profiles of live images."""
@@ -475,12 +475,12 @@ class _OperatorPage:
                         ui.link("open", address, new_tab=True)
                         continue
                     if file.kind == "cloud":
-                        self._button("show", partial(self._show, name)).props("flat dense")
+                        self._offer("show", partial(self._show, name)).props("flat dense")
                     if file.kind == "measured values":
-                        self._button("list", partial(self._measure.open, name)).props("flat dense")
+                        self._offer("list", partial(self._measure.open, name)).props("flat dense")
                     if file.kind == "capture":
-                        self._button("reconstruct", partial(self._reconstruct, name)).props("flat dense")
-                    self._button("about", partial(self._show_about, name)).props("flat dense")
+                        self._offer("reconstruct", partial(self._reconstruct, name)).props("flat dense")
+                    self._offer("about", partial(self._show_about, name)).props("flat dense")
 
     async def _show(self, name: str) -> None:
         await asyncio.to_thread(self._desk.open_cloud, name)

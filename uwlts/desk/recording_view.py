@@ -4,17 +4,14 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Self
 
 import numpy as np
 
-from uwlts.desk.server import DeskServer
 from uwlts.desk.shown_state import Board, FrameProfile, Picture
 from uwlts.errors import CaptureError
 from uwlts.model.calibration import AnyCalibration
-from uwlts.storage.calibration_file import resolve_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, part_path
 from uwlts.stripe import extract_stripe, warm_up
 
@@ -135,63 +132,3 @@ class BackgroundView:
         self._thread.join()
         if self._fault is not None and kind is None:
             raise self._fault
-
-
-def watch(
-    capture: str | Path,
-    *,
-    calibration: AnyCalibration | str | Path | None = None,
-    host: str = "127.0.0.1",
-    port: int = 8080,
-    report: Callable[[str], None] = print,
-) -> None:
-    """Show a recording in progress in a browser: the latest image with its stripe, and the cloud so far.
-
-    Ctrl-C ends it.
-
-    Parameters
-    ----------
-    capture : str or Path
-        Capture that is being recorded, or will be.
-    calibration : Calibration, PolynomialCalibration or path, optional
-        Calibration of the sensor, or polynomial calibration, for the cloud.
-    host : str
-        Address of the page; the default can be reached from this machine only.
-    port : int
-        Port of the page; if it is in use, the next free one is taken.
-    report : callable, optional
-        Called with lines of text, the first with the address of the page.
-
-    Raises
-    ------
-    CaptureError, CalibrationError
-        The finished capture is damaged; the calibration cannot be read, or does not fit the capture.
-    """
-    path, count = Path(capture), 0
-    known = None if calibration is None else resolve_calibration(calibration)
-    board = Board(path.name)
-    board.phase("waiting for the first image")
-    with DeskServer(board, host=host, port=port) as server:
-        try:
-            report(f"open {server.address}; Ctrl-C ends it")
-            if server.warning:
-                report(f"warning: {server.warning}")
-            view, begun = None, 0
-            for seen in follow_frames(path):
-                if seen is None:
-                    time.sleep(LOOK_S)
-                    continue
-                header, number, frame = seen
-                if view is None:
-                    board.phase("recording")
-                    view, begun = RecordingView(board, header, known, name=path.name), number
-                view.show(frame, number)
-                planned = header.provenance.get("images")
-                count = number + 1
-                if isinstance(planned, int) and planned >= count:
-                    board.count(count, planned, before=begun)
-            board.progress = replace(board.progress, phase="finished", left_s=None, busy=False)
-            report(f"{path} is finished with {count} images; the page stays until Ctrl-C")
-            threading.Event().wait()
-        except KeyboardInterrupt:
-            report("closed")

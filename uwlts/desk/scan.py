@@ -1,19 +1,15 @@
-"""Scans by a plan: a single one, optionally with the page of `uwlts watch`, or on request with the points of images.
+"""Scans by a plan: a single one, or on request with the points of images.
 
 The node of ROS 2 publishes these points as sensor_msgs/PointCloud2. Its libraries are imported when the node starts.
 """
 
-import ctypes
 import math
-import os
-import signal
-import subprocess
 import sys
 import threading
 import time
 from array import array
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, nullcontext
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
@@ -24,10 +20,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.joint.stored_estimate import require_joint
-from uwlts.desk.guided_screen import Ended
 from uwlts.desk.recording_view import LOOK_S, BackgroundView, follow_frames
-from uwlts.desk.shown_state import FrameProfile
+from uwlts.desk.shown_state import Ended, FrameProfile
 from uwlts.errors import CalibrationError, DescriptionError, Error, HardwareError, SetupError
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.camera_interface import CameraDevice
@@ -37,10 +31,9 @@ from uwlts.hardware.scan_plan import ScanPlan, load_plan
 from uwlts.hardware.scanning import ScanProgress, open_camera, record_scan
 from uwlts.model.calibration import AnyCalibration, Calibration, rigid_transform
 from uwlts.optics.fitness import check_fits
-from uwlts.recalibration.recalibrate import KnownPasses
 from uwlts.runtime.optional_library import pip_install
 from uwlts.runtime.progress import ProgressListener, ignore_progress
-from uwlts.storage.calibration_file import load_calibration, resolve_calibration
+from uwlts.storage.calibration_file import resolve_calibration
 from uwlts.storage.capture import CAPTURES, CaptureHeader, Frame, open_capture, part_path
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.ros_messages import (
@@ -53,10 +46,6 @@ from uwlts.storage.ros_messages import (
 )
 from uwlts.stripe import extract_stripe, warm_up
 
-_POLITE = 10  # reduction of the page's priority in favour of the recording, as by ``nice``
-_PATIENCE_S = 5.0  # for a process to end
-_SIGNAL_WHEN_PARENT_ENDS = 1  # PR_SET_PDEATHSIG of Linux's prctl
-
 
 def scan(
     plan: str | Path | ScanPlan,
@@ -66,9 +55,6 @@ def scan(
     stage: str | None = None,
     home: bool = False,
     unlock: bool = False,
-    watch: bool = False,
-    calibration: str | Path | None = None,
-    port: int = 8080,
     resume: bool = False,
     overwrite: bool = False,
     progress: ProgressListener = ignore_progress,
@@ -96,12 +82,6 @@ def scan(
         Home the stage first.
     unlock : bool
         Accept the stage's position without homing.
-    watch : bool
-        Show the recording in a browser, as uwlts watch does.
-    calibration : str or Path, optional
-        Watched: calibration of the sensor, or polynomial calibration, for the cloud.
-    port : int
-        Watched: port of the page; if it is in use, the next free one is taken.
     resume : bool
         Continue an interrupted scan; refused if the plan differs from that of the interrupted scan.
     overwrite : bool
@@ -131,16 +111,7 @@ def scan(
     refuse_unsuitable(Path(out), overwrite=overwrite, endings=CAPTURES)
     plan, out = plan if isinstance(plan, ScanPlan) else load_plan(Path(plan)), Path(out)
     address, serial_port = plan.devices(camera=camera, stage=stage)
-    if calibration:
-        if not watch:
-            raise DescriptionError("`calibration` is for the cloud on the page: give `watch` too")
-        load_calibration(calibration)
-    with ExitStack() as stack:
-        page = (
-            open_watch_page(out, calibration=calibration, port=port, say=report) if watch else nullcontext(lambda: None)
-        )
-        show = stack.enter_context(page)
-        moved, opened = stack.enter_context(GrblStage(serial_port)), stack.enter_context(open_camera(address))
+    with GrblStage(serial_port) as moved, open_camera(address) as opened:
         if home:
             report("homing")
             moved.home()
@@ -153,57 +124,8 @@ def scan(
             stage=moved,
             resume=resume,
             overwrite=overwrite,
-            listeners=ScanListeners(progress, report, warn, recorded=lambda frame, number: show()),
+            listeners=ScanListeners(progress, report, warn),
         )
-
-
-@contextmanager
-def open_watch_page(
-    capture: Path, *, calibration: str | Path | None, port: int, say: Callable[[str], None]
-) -> Iterator[Callable[[], None]]:
-    """Return a function that opens a page with a recording until the ``with`` ends; later calls do nothing.
-
-    It is called after the recording has begun: before that, a file of its name would be an older one. The page is a
-    separate process, which can neither slow the recording nor end it. ``say`` is called, from another thread, with a
-    line that states the page's address.
-    """
-    command = [sys.executable, "-m", "uwlts", "watch", str(capture), "--port", str(port)]
-    command += ["--calibration", str(calibration)] if calibration else []
-    opened: list[subprocess.Popen[str]] = []
-
-    def announce() -> None:
-        # Further lines are read, so that the pipe does not fill up.
-        for line in opened[0].stdout or ():
-            if line.startswith("open "):
-                say(f"{line.split(';')[0]}, while the scan runs")
-
-    def start() -> None:
-        if opened:
-            return
-        library = ctypes.CDLL(None)
-        # In a separate session, the terminal's Ctrl-C does not reach it. The kernel ends it if the scan is killed.
-        process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-            preexec_fn=lambda: library.prctl(_SIGNAL_WHEN_PARENT_ENDS, signal.SIGTERM),
-        )
-        opened.append(process)
-        os.setpriority(os.PRIO_PROCESS, process.pid, _POLITE)
-        threading.Thread(target=announce, daemon=True).start()
-
-    try:
-        yield start
-    finally:
-        for process in opened:
-            process.terminate()
-            try:
-                process.wait(_PATIENCE_S)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
 
 
 class PassAdvice:
@@ -214,6 +136,9 @@ class PassAdvice:
     """
 
     def __init__(self, calibration: AnyCalibration, *, pose_std_mm: float | None, pose_std_deg: float | None):
+        from uwlts.calibration.joint.stored_estimate import require_joint
+        from uwlts.recalibration.recalibrate import KnownPasses
+
         if not isinstance(calibration, Calibration):
             raise CalibrationError("advice on passes needs a joint calibration, not one by polynomials")
         require_joint(calibration)
@@ -291,7 +216,7 @@ class ScanService:
         if isinstance(self._source, Path):
             work, text = self._play, f"playing {self._source.name}"
         else:
-            path = self._free_path(self._source.title)
+            path = self._find_free_path(self._source.title)
             check_fits(self._source.header(path.stem), self._calibration, source=path.name)
             work, text = lambda: self._record(path), f"recording {path.name}"
         self._stop.clear()
@@ -337,7 +262,7 @@ class ScanService:
         self.state.level = "warning"
         self._report(f"warning: {text}")
 
-    def _free_path(self, title: str) -> Path:
+    def _find_free_path(self, title: str) -> Path:
         name = "".join(sign if sign.isalnum() else "-" for sign in title.lower())
         paths = (self._folder / f"{name}-{number:03}.h5" for number in count(1))
         return next(path for path in paths if not (path.exists() or part_path(path).exists()))

@@ -24,6 +24,10 @@ FIELDS: tuple[CloudField, ...] = ("intensity", "deviation", "random", "common")
 _COLUMNS = 3 + len(FIELDS)  # coordinates first
 
 
+class Ended(Exception):
+    """Raised when the operator has ended the recording."""
+
+
 def point_table(points_mm: np.ndarray, **fields: np.ndarray | None) -> np.ndarray:
     """Return points (N, 7): coordinates in mm, then fields (N,) by the names in `FIELDS`, NaN if unknown."""
     table = np.full((len(points_mm), _COLUMNS), np.nan)

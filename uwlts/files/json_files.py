@@ -131,7 +131,7 @@ def describe_differences(there: object, now: object) -> str:
 
     ``there`` is the content of a file, ``now`` the wanted one.
     """
-    found = [f"{entry} is {_shorten(old)} in it, {_shorten(new)} now" for entry, old, new in _different(there, now, "")]
+    found = [f"{entry} is {_shorten(old)} in it, {_shorten(new)} now" for entry, old, new in _compare(there, now, "")]
     more = [f"and {len(found) - _SHOWN} more"] if len(found) > _SHOWN else []
     return "; ".join(found[:_SHOWN] + more)
 
@@ -141,13 +141,13 @@ def describe_other_plan(there: dict[str, JsonValue], now: dict[str, JsonValue]) 
     return f"another {', '.join(key for key in now if there.get(key) != now[key])} ({describe_differences(there, now)})"
 
 
-def _different(there: object, now: object, entry: str) -> Iterator[tuple[str, object, object]]:
+def _compare(there: object, now: object, entry: str) -> Iterator[tuple[str, object, object]]:
     if isinstance(there, dict) and isinstance(now, dict):
         for key in dict.fromkeys((*now, *there)):
-            yield from _different(there.get(key), now.get(key), f"{entry}.{key}" if entry else f"{key}")
+            yield from _compare(there.get(key), now.get(key), f"{entry}.{key}" if entry else f"{key}")
     elif isinstance(there, list) and isinstance(now, list) and len(there) == len(now):
         for place, (old, new) in enumerate(zip(there, now, strict=True)):
-            yield from _different(old, new, f"{entry}[{place}]")
+            yield from _compare(old, new, f"{entry}[{place}]")
     elif there != now:
         yield entry, there, now
 

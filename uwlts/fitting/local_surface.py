@@ -113,7 +113,7 @@ class PatchErrors:
 
     def height_changes(self) -> csr_array:
         """Return the changes (P, C + J I), mm, of the heights for one standard deviation of each independent error."""
-        return csr_array(hstack([self._differentiate_by_noise(), *self._by_images()], format="csr"))
+        return csr_array(hstack([self._differentiate_by_noise(), *self._sum_by_images()], format="csr"))
 
     def noise_variance(self) -> np.ndarray:
         """Return the variance (P,), mm2, of the heights by noise."""
@@ -122,12 +122,12 @@ class PatchErrors:
     def image_variance(self) -> np.ndarray:
         """Return the variance (P,), mm2, of the heights by errors of images."""
         return sum(
-            (np.asarray((each * each).sum(axis=1)).ravel() for each in self._by_images()), np.zeros(len(self.rows))
+            (np.asarray((each * each).sum(axis=1)).ravel() for each in self._sum_by_images()), np.zeros(len(self.rows))
         )
 
     def correlation(self, *, by_images: bool) -> float:
         """Return the variance of the sum of all heights relative to the sum of their variances, by noise or images."""
-        parts = self._by_images() if by_images else [self._differentiate_by_noise()]
+        parts = self._sum_by_images() if by_images else [self._differentiate_by_noise()]
         together = sum(float(np.sum(np.asarray(each.sum(axis=0)) ** 2)) for each in parts)
         single = sum(float((each * each).sum()) for each in parts)
         return together / single if single > 0 else 1.0
@@ -135,7 +135,7 @@ class PatchErrors:
     def _differentiate_by_noise(self) -> csr_array:
         return self._make_sparse(self.rows * self.noise_mm[:, None] / np.sqrt(self.counts[self.near]))
 
-    def _by_images(self) -> list[csr_array]:
+    def _sum_by_images(self) -> list[csr_array]:
         along = (np.einsum("pki,pi->pk", shift[self.near], self.normals) for shift in self.image_shifts_mm)
         return [csr_array(self._make_sparse(self.rows * each) @ self.images) for each in along]
 

@@ -108,7 +108,7 @@ def schur_least_squares(
     if normal is None:
         raise CalibrationError("the initial parameters place observed points behind the camera: check points and poses")
     for rounds in range(1, _ROUNDS + 1):
-        global_step, local_steps = _step(normal, damping)
+        global_step, local_steps = _solve_step(normal, damping)
         tried_global = global_values + global_step
         tried_local = [value + step for value, step in zip(local, local_steps, strict=True)]
         scales = (normal.scale, *(group.scale for group in normal.groups))
@@ -203,7 +203,7 @@ def _compute_column_lengths(squares: np.ndarray) -> np.ndarray:
     return np.where(squares > 0, np.sqrt(squares), 1.0)
 
 
-def _step(normal: _Normal, damping: float) -> tuple[np.ndarray, list[np.ndarray]]:
+def _solve_step(normal: _Normal, damping: float) -> tuple[np.ndarray, list[np.ndarray]]:
     """Solve for the damped step; each block is positive definite for positive damping."""
     reduced = normal.block + damping * np.eye(len(normal.block))
     right = -normal.gradient

@@ -346,7 +346,7 @@ class AravisCamera(CameraDevice):
     def _trigger(self) -> None:
         self._call("software_trigger")
 
-    def _next(self, timeout_s: float) -> Delivered | None:
+    def _take_next(self, timeout_s: float) -> Delivered | None:
         functions, stream = self._functions, self._stream
         buffer = functions.arv_stream_timeout_pop_buffer(stream, int(1e6 * timeout_s))
         if buffer is None:
@@ -385,7 +385,7 @@ class AravisCamera(CameraDevice):
             return self._call("get_integer", f"Chunk{_ENCODER}".encode())
         return None
 
-    def _answers(self) -> None:
+    def _check_answer(self) -> None:
         self._read_numbers("get_region", 4)
 
     def _read_numbers(self, name: str, count: int) -> list[int]:

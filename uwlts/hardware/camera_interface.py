@@ -316,7 +316,7 @@ class CameraDevice(ABC):
             raise HardwareError(
                 f"the camera {self.address} is configured for trigger '{self.settings.trigger}', not 'software'"
             )
-        while self._next(0.0) is not None:
+        while self._take_next(0.0) is not None:
             self._check.restart_comparison("late")
         self._trigger()
 
@@ -330,7 +330,7 @@ class CameraDevice(ABC):
         deadline = time.monotonic() + timeout_s
         while True:
             left_s = max(deadline - time.monotonic(), 0.0)
-            frame = self._next(min(left_s, _WAIT_S))
+            frame = self._take_next(min(left_s, _WAIT_S))
             if frame is None:
                 if left_s > _WAIT_S:
                     waiting()
@@ -371,7 +371,7 @@ class CameraDevice(ABC):
                 f"the camera {self.address} did not answer a trigger within {timeout_s:g} s; its exposure is "
                 f"{self.settings.exposure_ms} ms. It still answers commands: the frame or the trigger was lost"
             )
-        self._answers()
+        self._check_answer()
         self._started = True
         return HardwareError(
             f"the camera {self.address} gave no frame within {timeout_s:g} s though it answers commands: its frames "
@@ -414,11 +414,11 @@ class CameraDevice(ABC):
         """Trigger one frame."""
 
     @abstractmethod
-    def _next(self, timeout_s: float) -> Delivered | None:
+    def _take_next(self, timeout_s: float) -> Delivered | None:
         """Return the next frame, or None if none arrives within ``timeout_s`` (at most 0.1 s)."""
 
     @abstractmethod
-    def _answers(self) -> None:
+    def _check_answer(self) -> None:
         """Raise HardwareError if the camera is gone."""
 
 
@@ -479,7 +479,7 @@ class ReplayCamera(CameraDevice):
     def _trigger(self) -> None:
         self._triggered = True
 
-    def _next(self, timeout_s: float) -> Delivered | None:
+    def _take_next(self, timeout_s: float) -> Delivered | None:
         if self.settings.trigger == "software":
             if not self._triggered:
                 time.sleep(timeout_s)
@@ -502,7 +502,7 @@ class ReplayCamera(CameraDevice):
             )
         return Delivered(image, shown + 1, stamp_s, exposure_ms)
 
-    def _answers(self) -> None:
+    def _check_answer(self) -> None:
         """Files need no check: reading a missing one raises an error."""
 
 

@@ -250,22 +250,21 @@ class _FrameReader:
         known = [each for one in list(self._passes) for each in list(one)]
         if not known:
             return
-        times, places = np.array([_time_of(each) for each in known]), [each.position_mm for each in known]
+        times, places = np.array([_date(each) for each in known]), [each.position_mm for each in known]
         while self._pending and (self._pending[0][1] < times[-1] or self.end_s is not None):
             frame, middle_s = self._pending.popleft()
             place = float(np.interp(middle_s, times, places))
             if not (self._within_mm[0] <= place <= self._within_mm[1] and times[0] <= middle_s <= times[-1]):
                 continue
-            encoder = None if frame.encoder is None else float(frame.encoder)
             exposure_ms = self._exposure_ms if frame.exposure_ms is None else frame.exposure_ms
-            kept = Frame(frame.image, place, True, exposure_ms, middle_s - self._began_s, encoder=encoder)
+            kept = Frame(frame.image, place, True, exposure_ms, middle_s - self._began_s)
             self._writer.append(kept)
             header = self._writer.header
             along, full_dn = header.sensor.camera.stripe_along, header.saturation_dn
             stripe = extract_stripe(frame.image, stripe_along=along, saturation=full_dn)
             self._stripes.append(stripe.centre_px)
             self._times.append(middle_s)
-            self._encoders.append(np.nan if encoder is None else encoder)
+            self._encoders.append(np.nan if frame.encoder is None else frame.encoder)
             self._stored(kept, stripe, len(self._times) - 1)
 
     def assign_positions(
@@ -289,7 +288,7 @@ class _FrameReader:
             )
         stage, speed, scatters, speeds = np.full(len(times), np.nan), np.zeros(len(times)), [], []
         for one in self._passes:
-            within = (times >= _time_of(one[0])) & (times <= _time_of(one[-1])) if one else np.zeros(len(times), bool)
+            within = (times >= _date(one[0])) & (times <= _date(one[-1])) if one else np.zeros(len(times), bool)
             if not within.any():
                 continue
             constant = [each for each in one if even[0] <= each.position_mm <= even[1]]
@@ -312,7 +311,7 @@ class _FrameReader:
             except EvaluationError as error:
                 warn(f"the latency of the stage is unknown and taken as 0: {error}")
         stage = stage + speed * latency_s
-        reports = [(_time_of(each) - self._began_s, each.position_mm) for one in self._passes for each in one]
+        reports = [(_date(each) - self._began_s, each.position_mm) for one in self._passes for each in one]
         self._writer.place(stage, speed, np.array(reports))
         known = "as given" if std_s is None else f"measured, std {1e3 * std_s:.3f} ms"
         return (
@@ -321,7 +320,7 @@ class _FrameReader:
         )
 
 
-def _time_of(report: StageReport) -> float:
+def _date(report: StageReport) -> float:
     return 0.5 * (report.asked_s + report.answered_s)
 
 
@@ -340,7 +339,7 @@ def _fit_line(reports: list[StageReport], at_s: np.ndarray) -> tuple[np.ndarray,
     took = np.sort([each.answered_s - each.asked_s for each in reports])
     longest = max(_SLOW_REPORT * took[0], took[max(len(reports) // 2, _FEWEST_REPORTS - 1)])
     used = [each for each in reports if each.answered_s - each.asked_s <= longest]
-    times, places = np.array([_time_of(each) for each in used]), np.array([each.position_mm for each in used])
+    times, places = np.array([_date(each) for each in used]), np.array([each.position_mm for each in used])
     middle, kept, speed, start = times.mean(), np.ones(len(used), bool), 0.0, 0.0
     outside, fitted = places, kept
     for _ in range(3):

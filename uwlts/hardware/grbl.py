@@ -111,7 +111,7 @@ class GrblAxis(GrblLine):
         expected_s = abs(way_mm) / feed_mm_s + feed_mm_s / self.settings.acceleration_mm_per_s2
         # Grbl acknowledges a dwell when all earlier movements are done.
         self.command("G4P0.01", timeout_s=_MARGIN * expected_s + _MARGIN_S, watch=watch)
-        reached_mm = self._rest()
+        reached_mm = self._await_rest()
         missing = round((reached_mm - position_mm) * self.settings.steps_per_mm)
         if abs(missing) > 1:
             raise self.stop_and_make_error(
@@ -139,7 +139,7 @@ class GrblAxis(GrblLine):
 
         return check
 
-    def _rest(self) -> float:
+    def _await_rest(self) -> float:
         """Wait until the controller reports Idle, and return the position in mm."""
         deadline = time.monotonic() + _MARGIN_S
         while (report := self.status()).state != "Idle":

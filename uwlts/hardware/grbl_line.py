@@ -316,7 +316,7 @@ class GrblLine:
                 heard = line
                 if "Grbl" in line or "FluidNC" in line:
                     raise HardwareError(f"{self.port} is not Grbl 1.1, it answers {heard!r}: flash Grbl 1.1h")
-        if heard := heard or _readable(self._received[:60]):
+        if heard := heard or _decode_readably(self._received[:60]):
             raise HardwareError(
                 f"{self.port} does not speak Grbl, it answers {heard!r}: wrong port, or not {_BAUD} baud"
             )
@@ -555,7 +555,7 @@ class GrblLine:
         """Return the next line that is not empty, or None at the deadline."""
         while True:
             while (end := self._received.find(b"\n")) >= 0:
-                line = _readable(self._received[:end].strip(b"\r"))
+                line = _decode_readably(self._received[:end].strip(b"\r"))
                 del self._received[: end + 1]
                 if line:
                     return line
@@ -575,7 +575,7 @@ class GrblLine:
                 raise self.stop_and_make_error(f"the connection is lost: {error}; is the cable plugged in?") from error
 
 
-def _readable(data: bytes | bytearray) -> str:
+def _decode_readably(data: bytes | bytearray) -> str:
     return data.decode("ascii", errors="backslashreplace")
 
 

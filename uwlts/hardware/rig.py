@@ -226,7 +226,7 @@ class Rig:
     def frame(self, light: Light, exposure_ms: float) -> GrabbedFrame:
         """Take a frame in a light, "lamp" being without laser."""
         if self._exposure_ms is None or abs(self._exposure_ms / exposure_ms - 1) >= 1e-6:
-            self._rest()
+            self._darken()
             camera, gain_db, bits = self._camera, self._plan.gain_db, self._sensor.detector.bits
             camera.stop()
             camera.configure(exposure_ms=exposure_ms, gain_db=gain_db, bits=bits, trigger="software")
@@ -248,7 +248,7 @@ class Rig:
             longest_s = 1e-3 * (self._exposure_ms or 0.0) + _LIGHT_S
             self._stage.laser(on, power=self._plan.laser_power, at_most_s=longest_s)
 
-    def _rest(self) -> None:
+    def _darken(self) -> None:
         """Switch the laser off; an operator is asked only before an image without laser."""
         if not isinstance(self._stage, HandSwitchedLaser):
             self._switch_laser(False)
@@ -264,7 +264,7 @@ class Rig:
             except HardwareError as error:
                 # Switch off first: closing a camera that is gone takes time.
                 with suppress(HardwareError):
-                    self._rest()
+                    self._darken()
                 # If the camera's driver hangs, the guard switches the laser off; the fault to report is the camera's.
                 if self._stage.faulty or not self._camera.running:
                     raise
@@ -273,7 +273,7 @@ class Rig:
                 self.repeated += 1
             else:
                 # Also checks whether the laser was on all the time.
-                self._rest()
+                self._darken()
                 return frame
 
     def _take_one(self) -> GrabbedFrame:
@@ -288,7 +288,7 @@ class Rig:
             if time.monotonic() < lit_until_s:
                 self._stage.keep_lit()
             else:
-                self._rest()
+                self._darken()
 
         frame = self._camera.grab(_PATIENCE_S + exposure_s, waiting=waiting)
         came_s, known = time.monotonic(), len(self._latencies_s) > 0
@@ -298,7 +298,7 @@ class Rig:
         if not lit or came_s <= lit_until_s:
             return frame
         # Before anything else: it shows whether the guard, not the controller, has ended the light.
-        self._rest()
+        self._darken()
         if not (known and began_s + exposure_s + _PROMPT_S < lit_until_s):
             raise HardwareError(
                 f"the camera {self._camera.address} gave a frame {came_s - asked_s:.2g} s after its trigger, and the "

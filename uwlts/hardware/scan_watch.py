@@ -90,7 +90,7 @@ class SlipWatch:
         with np.errstate(invalid="ignore"):
             steep = (np.abs(motion) > _LEAST_RELIEF) & (np.abs(bend) < _LARGEST_BEND_PX)
         # The bend has six times the variance of a centre, and a slip twice that variance.
-        if steep.sum() >= FEWEST_LINES and _standard_error(bend[steep] / np.sqrt(3), motion[steep]) <= LARGEST_MM / 3:
+        if steep.sum() >= FEWEST_LINES and _estimate_error(bend[steep] / np.sqrt(3), motion[steep]) <= LARGEST_MM / 3:
             self.place, self._motion_px_per_mm = here, np.where(steep, motion, np.nan)
 
     def measure_slip(self, again: np.ndarray) -> tuple[float, float]:
@@ -109,7 +109,7 @@ class SlipWatch:
         order = np.argsort(slips)
         heaped = np.cumsum(weights[order])
         slip_mm = float(slips[order][np.searchsorted(heaped, heaped[-1] / 2)])
-        return slip_mm, _standard_error(shift - slip_mm * motion, motion)
+        return slip_mm, _estimate_error(shift - slip_mm * motion, motion)
 
     def is_significant(self, slip_mm: float, error_mm: float) -> bool:
         """Return whether a slip exceeds `LARGEST_MM` and its uncertainty."""
@@ -121,7 +121,7 @@ def select_centres(stripe: Stripe) -> np.ndarray:
     return np.where(stripe.status == StripeStatus.OK, stripe.centre_px, np.nan)
 
 
-def _standard_error(scatter_px: np.ndarray, motion_px_per_mm: np.ndarray) -> float:
+def _estimate_error(scatter_px: np.ndarray, motion_px_per_mm: np.ndarray) -> float:
     """Return the standard error in mm of the slip from all lines."""
     spread = robust_std(scatter_px - np.median(scatter_px))
     return float(_GRAIN * spread / np.sqrt(np.sum(motion_px_per_mm**2)))

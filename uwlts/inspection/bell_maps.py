@@ -149,11 +149,11 @@ def limit_deviations(
         found: Any = tree.query(surface.places[part], k=SEARCH_RULE.neighbours + 1, workers=-1)
         nearest[part] = found[1][:, 1:]
         beside = surface.heights[nearest[part]]
-        middle[part] = _median_of_rows(beside)
-        spread[part] = MAD_TO_STD * _median_of_rows(np.abs(beside - middle[part, None]))
+        middle[part] = _find_row_medians(beside)
+        spread[part] = MAD_TO_STD * _find_row_medians(np.abs(beside - middle[part, None]))
     usually = float(np.median(spread))
     # Wild points nearby increase the scatter of one place, a blemish that of many.
-    spread = np.concatenate([_median_of_rows(spread[nearest[part]]) for part in parts])
+    spread = np.concatenate([_find_row_medians(spread[nearest[part]]) for part in parts])
     spread = np.maximum(spread, usually)
     off, most = surface.heights - middle, SEARCH_RULE.most_deviation * spread
     outliers, limited = np.abs(off) > SEARCH_RULE.outlier * spread, np.clip(off, -most, most)
@@ -183,7 +183,7 @@ def find_together(places: np.ndarray, chosen: np.ndarray, radius: float, false_a
     return points[np.unique(np.concatenate([np.zeros(0, int), *(np.array(each, int) for each in full)]))]
 
 
-def _median_of_rows(values: np.ndarray) -> np.ndarray:
+def _find_row_medians(values: np.ndarray) -> np.ndarray:
     """Return the medians (N,) of rows (N, K) of an odd number of values without NaN, for which NumPy's would look."""
     middle = values.shape[1] // 2
     return np.partition(values, middle, axis=1)[:, middle]

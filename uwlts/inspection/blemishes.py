@@ -346,11 +346,9 @@ class _Field:
         widest = float(np.max(measure_spacing(surface.places[near], np.flatnonzero(~ring))))
         region = KDTree(places[~ring]).query(grid)[0] < min(bandwidth, max(search.smallest_mm, widest))
         size = surface.footprint_mm[near]
-        sharp = seen = _interpolation_rows((places - grid[0]) / cell, shape)
+        sharp = seen = _interpolate((places - grid[0]) / cell, shape)
         if np.any(size > 0):
-            parts = [
-                weight * _interpolation_rows((places + node * size - grid[0]) / cell, shape) for node, weight in _NODES
-            ]
+            parts = [weight * _interpolate((places + node * size - grid[0]) / cell, shape) for node, weight in _NODES]
             seen = sparse.csr_array(sum(parts[1:], parts[0]))
         design = np.column_stack([np.ones(len(places)), places])
         plane, outer = fit_biweight(design, heights, ring)[0], np.zeros((3, len(near)))
@@ -576,7 +574,7 @@ def _measure_section(profile: np.ndarray, edge: float, cell: float) -> tuple[flo
     return length, body + rims
 
 
-def _interpolation_rows(places: np.ndarray, shape: tuple[int, int]) -> sparse.csr_array:
+def _interpolate(places: np.ndarray, shape: tuple[int, int]) -> sparse.csr_array:
     """Return rows (n, G) that interpolate a grid at places (n, 2) in cells, and are zero beyond its border."""
     (first, along), (second, around) = (cubic_weights(place, n) for place, n in zip(places.T, shape, strict=True))
     columns = (first[:, :, None] * shape[1] + second[:, None, :]).ravel()

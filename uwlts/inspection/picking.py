@@ -275,7 +275,7 @@ class MeasuredValue(Description):
         return self.name, self.quantity, self._format_figure(self.value_mm), stated, *limits, self.verdict, self.source
 
     def _format_figure(self, value_mm: float | None) -> str:
-        return MISSING if value_mm is None else format_to_scale(value_mm, self.expanded_mm or _SHOWN_MM, digits=2)
+        return MISSING if value_mm is None else format_to_scale(value_mm, self.expanded_mm or _SHOWN_MM)
 
 
 class MeasuredValues(Description):

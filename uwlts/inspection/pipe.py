@@ -44,7 +44,6 @@ _FEWEST_POINTS = 500  # fewest points for a search on a pipe's surface
 def inspect_pipe(
     cloud: PointCloud | str | os.PathLike[str],
     *,
-    section_mm: float | None = None,
     wall_mm: float | None = None,
     false_alarm: float = 0.05,
     largest_ovality: float = LARGEST_OVALITY,
@@ -63,8 +62,6 @@ def inspect_pipe(
     ----------
     cloud
         Cloud of the object, or its file (.ply, .h5; from other programs .las, .laz, .e57, and text in mm).
-    section_mm
-        Length of a section along the pipe (or a weld); by default up to twelve sections.
     wall_mm
         Thickness of the pipe's undamaged wall, for the remaining wall.
     false_alarm
@@ -124,15 +121,14 @@ def inspect_pipe(
         after = form.distance_mm[~damaged]
         if np.std(after - before) > _MOVED * robust_std(after):
             search = _search_form(cloud, form, chosen, false_alarm)
-    features, of_sections = pipe_features(cloud, form, section_mm=section_mm)
+    features, of_sections = pipe_features(cloud, form)
     of_welds, on_welds = _make_weld_features(cloud, form, welds)
     blemishes = _Blemishes(cloud, form, chosen, search, wall_mm)
     features += [*of_welds, *blemishes.measure_all()]
-    deviation, level = np.full(len(cloud), np.nan), np.full(len(cloud), np.nan)
+    deviation = np.full(len(cloud), np.nan)
     deviation[chosen[~search.outliers]] = form.distance_mm[chosen[~search.outliers]]
-    level[chosen] = search.level_mm
     notes = *regions, *_note_limits(cloud, form, search), *of_size, *off, *of_sections, *on_welds, *blemishes.notes
-    found = Inspection("pipe", tuple(features), deviation, level, notes)
+    found = Inspection("pipe", tuple(features), deviation, notes)
     return found.consider_cloud(cloud)
 
 

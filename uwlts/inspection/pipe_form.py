@@ -40,7 +40,7 @@ class PipeFormRule:
     section_points: int = 60  # fewest points of a section
     section_arc: float = 0.8
     """Least arc of a section, as a fraction of the whole pipe's arc (at most half of the circumference)."""
-    most_sections: int = 12  # number of sections by default
+    sections: int = 12  # of the whole pipe
     off_pipe: float = 0.06
     """Distance from the pipe, as a fraction of its radius, of the deepest blemish or largest ovality that still
     counts as its surface."""
@@ -199,15 +199,8 @@ def _fit_from(
     return PipeForm(*known, largest_ovality)
 
 
-def pipe_features(
-    cloud: PointCloud, form: PipeForm, *, section_mm: float | None = None
-) -> tuple[list[Feature], list[str]]:
-    """Return the pipe and its sections with uncertainty, and notes on omitted sections.
-
-    By default the pipe has twelve sections. Sections of fewer than 60 points are omitted.
-
-    Raises EvaluationError if `section_mm` is not positive.
-    """
+def pipe_features(cloud: PointCloud, form: PipeForm) -> tuple[list[Feature], list[str]]:
+    """Return the pipe and its twelve sections with uncertainty, and notes on those with fewer than 60 points."""
     used = form.used
     errors = PointErrors.along_normals(cloud, used, form.frame.normals_at(form.angle[used]))
     whole = _make_whole_values(form, errors)
@@ -215,10 +208,7 @@ def pipe_features(
     features = [Feature(FeatureKind.PIPE, "pipe", whole, form.frame.point_mm, form.frame.axes, extent, used)]
     along = form.along_mm[used]
     low, length = float(along.min()), float(np.ptp(along))
-    if section_mm is not None and not 0 < section_mm < np.inf:
-        raise EvaluationError(f"section_mm is {section_mm:g}; expected a positive length in mm")
-    count = max(1, int(length / section_mm)) if section_mm else FORM_RULE.most_sections
-    edges = low + length * np.arange(count + 1) / count
+    edges = low + length * np.arange(FORM_RULE.sections + 1) / FORM_RULE.sections
     terms = _ROUND_TERMS if form.is_seen_round else ("1",)
     raw = form.distance_mm + _evaluate_terms(form.along_mm, form.angle, form.scale_mm, form.terms, form.coefficients)
     notes: list[str] = []
@@ -250,7 +240,7 @@ def pipe_features(
 
 def _make_whole_values(form: PipeForm, errors: PointErrors) -> tuple[FeatureValue, ...]:
     kind, used, coefficients, diameter = FeatureKind.PIPE, form.used, form.coefficients, 2 * form.radius_mm
-    random, common = errors.covariances(form.weights, form.distance_mm[used], _neighbourhoods(form, used))
+    random, common = errors.covariances(form.weights, form.distance_mm[used], _number_sectors(form, used))
     if not form.is_seen_round:
         by_ovality = form.weights @ _bound_unseen_ovality(form, used)
         common = by_ovality @ by_ovality.T + (0.0 if common is None else common)
@@ -319,7 +309,7 @@ def _measure_arc_diameter(
     by_axis = weights @ _make_design(form.along_mm[members], form.angle[members], form.scale_mm, form.terms)[:, moved]
     whole = -by_axis @ form.weights[moved]
     whole[inside] += weights
-    random, common = errors.covariances(whole[None], form.distance_mm[form.used], _neighbourhoods(form, form.used))
+    random, common = errors.covariances(whole[None], form.distance_mm[form.used], _number_sectors(form, form.used))
     by_ovality = whole @ _bound_unseen_ovality(form, form.used)
     common = np.array([[by_ovality @ by_ovality]]) + (0.0 if common is None else common)
     diameter = 2 * (form.radius_mm + off)
@@ -336,7 +326,7 @@ def _bound_unseen_ovality(form: PipeForm, points: np.ndarray) -> np.ndarray:
     return std * np.column_stack([np.cos(2 * form.angle[points]), np.sin(2 * form.angle[points])])
 
 
-def _neighbourhoods(form: PipeForm, used: np.ndarray) -> np.ndarray:
+def _number_sectors(form: PipeForm, used: np.ndarray) -> np.ndarray:
     """Return the neighbourhood (K,) of each point: sectors of 5 deg by twelfths of the length."""
     along = form.along_mm[used]
     row = np.floor((along - along.min()) / max(float(np.ptp(along)), 1e-9) * (FORM_RULE.lengths - 1e-3)).astype(

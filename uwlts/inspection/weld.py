@@ -82,7 +82,7 @@ class _Rule:
     """Least gap between beads side by side at half their height, as a fraction of their total width."""
 
 
-def inspect_weld(cloud: PointCloud | str | os.PathLike[str], *, section_mm: float | None = None) -> Inspection:
+def inspect_weld(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
     """Measure the highest weld bead of a cloud: height, width, undercut, toe angles and misalignment.
 
     The plates on both sides are fitted robustly. The bead runs along the longest extent of the points above the plates.
@@ -92,8 +92,6 @@ def inspect_weld(cloud: PointCloud | str | os.PathLike[str], *, section_mm: floa
     ----------
     cloud
         See `inspect_pipe`.
-    section_mm
-        Length of a section along the weld. By default sections are as short as the number of points allows.
 
     Returns
     -------
@@ -105,11 +103,9 @@ def inspect_weld(cloud: PointCloud | str | os.PathLike[str], *, section_mm: floa
     CaptureError
         The file cannot be read.
     EvaluationError
-        The cloud shows no bead, or `section_mm` is not positive.
+        The cloud shows no bead.
     """
     cloud = load_cloud(cloud)
-    if section_mm is not None and not 0 < section_mm < np.inf:
-        raise EvaluationError(f"section_mm is {section_mm:g}; expected a positive length in mm")
     if len(cloud) < _Rule.fewest_points:
         raise EvaluationError(
             f"the cloud has {len(cloud)} points; at least {_Rule.fewest_points} are needed for a weld"
@@ -118,7 +114,7 @@ def inspect_weld(cloud: PointCloud | str | os.PathLike[str], *, section_mm: floa
     local = (cloud.points_mm - middle) @ axes.T
     local[(local[:, 0] < ends[0]) | (local[:, 0] > ends[1])] = np.inf
     tangents = np.broadcast_to(axes[:2], (len(cloud), 2, 3))
-    bead = build_bead(cloud, local, tangents, half_mm=half, section_mm=section_mm)
+    bead = build_bead(cloud, local, tangents, half_mm=half)
     errors = PointErrors.along_normals(cloud, bead.chosen, np.broadcast_to(axes[2], (len(bead.chosen), 3)))
     values, extent, left_out = measure_bead(bead, errors)
     feature = Feature(FeatureKind.WELD, "weld", values, middle, axes, extent, bead.chosen[bead.on_bead])
@@ -131,7 +127,7 @@ def inspect_weld(cloud: PointCloud | str | os.PathLike[str], *, section_mm: floa
     notes += left_out
     if cloud.uncertainty is None:
         notes.append(WITHOUT_UNCERTAINTY)
-    return Inspection("weld", (feature,), deviation, np.full(len(cloud), np.nan), tuple(notes)).consider_cloud(cloud)
+    return Inspection("weld", (feature,), deviation, tuple(notes)).consider_cloud(cloud)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,14 +146,12 @@ class Bead:
     footprint_std: float  # relative standard uncertainty of the squared footprints
 
 
-def build_bead(
-    cloud: PointCloud, local: np.ndarray, tangents: np.ndarray, *, half_mm: float, section_mm: float | None = None
-) -> Bead:
+def build_bead(cloud: PointCloud, local: np.ndarray, tangents: np.ndarray, *, half_mm: float) -> Bead:
     """Return a bead with its plates and profiles.
 
     ``local`` (N, 3) are places along the bead, across it and heights, mm; not finite for points that do not count.
     ``tangents`` (N, 2, 3) are unit vectors along and across it at the points. ``half_mm`` is the approximate half
-    width, ``section_mm`` the length of a section.
+    width.
 
     Raises EvaluationError if the points do not show the plates on both sides of the bead.
     """
@@ -176,8 +170,6 @@ def build_bead(
     count = max(1, len(along) // _Rule.points_in_section)
     # With several sections per image it would be random which section has points.
     count = min(count, _Rule.most_sections, images if images > 1 else count)
-    if section_mm is not None:
-        count = max(1, int(length / section_mm))
     section = np.clip(((along - along.min()) / length * count).astype(int), 0, count - 1)
     # The gap between points of a section that contains the median place across.
     order = np.lexsort((across, section))

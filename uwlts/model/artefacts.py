@@ -75,17 +75,11 @@ def parse_artefact(table: object) -> Artefact:
         raise EvaluationError(f"the artefact's description is not valid: {describe_problems(error)}") from error
 
 
-def read_artefact(path: str | Path) -> Artefact:
-    """Read an artefact's description from a TOML file.
+def resolve_artefact(given: object) -> Artefact | None:
+    """Return the artefact given itself, as a table, or by the path of a TOML file; None stays None.
 
     Raises CaptureError if the file cannot be read, DescriptionError if it is not TOML, and EvaluationError if it does
     not describe an artefact.
     """
-    return parse_artefact(read_toml(path, called="artefact"))
-
-
-def resolve_artefact(given: object) -> Artefact | None:
-    """Return the artefact given itself, as a table, or by the path of its description; None stays None."""
-    if isinstance(given, str | Path):
-        return read_artefact(given)
-    return None if given is None else parse_artefact(given)
+    table = read_toml(given, called="artefact") if isinstance(given, str | Path) else given
+    return None if table is None else parse_artefact(table)

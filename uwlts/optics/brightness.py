@@ -118,8 +118,8 @@ class IlluminatedPoints:
 
         The sheet's thickness is the described one, limited by the median stripe width.
 
-        ``width_px`` (N,) is the full width at half maximum, NaN where unknown; ``slopes`` (N,) are those of
-        `fit_brightness_slopes`; the direction is as the capture describes it.
+        ``width_px`` (N,) is the full width at half maximum; ``slopes`` (N,) are those of `fit_brightness_slopes`; the
+        direction is as the capture describes it.
         """
         direction = np.array(self.calibration.stage_direction_of(stage_direction))
         across = float(
@@ -127,8 +127,7 @@ class IlluminatedPoints:
         )
         if abs(across) < _LEAST_ACROSS or not slopes.any():
             return np.zeros((len(slopes), 3))
-        known = width_px[np.isfinite(width_px)]
-        widest = (np.median(known) if len(known) else np.inf) / FWHM_PER_SIGMA
+        widest = np.median(width_px) / FWHM_PER_SIGMA
         return self.of_slope * (slopes / across * np.minimum(1.0, (widest / self.per_sigma_px) ** 2))[:, None]
 
     def footprint_mm(self, width_px: np.ndarray) -> tuple[float, float]:
@@ -143,9 +142,9 @@ class IlluminatedPoints:
         position u. A surface height h(u) changes the image by -S' h, and the centroid by the integral of
         -u S' h = (u / s)^2 S h. These weights of h have the variance 3 s^2, whereas the light has s^2.
 
-        ``width_px`` (N,) is the full width of each stripe at half maximum; NaN where unknown.
+        ``width_px`` (N,) is the full width of each stripe at half maximum.
         """
-        chosen = np.flatnonzero(np.isfinite(width_px) & (self.found.status == RayStatus.OK))
+        chosen = np.flatnonzero(self.found.status == RayStatus.OK)
         chosen = chosen[:: max(1, len(chosen) // _MOST_FOR_FOOTPRINT)]
         line, place = self.line[chosen], self.centre_px[chosen]
         # Neighbouring lines must stay within the table.
@@ -175,8 +174,7 @@ def _make_sheet_function(
         per_mm = ray[:count] @ frame[:3, :3] / slope[:count, None]
         per_px = (found.points_mm[count:, :] - in_camera) @ frame[:3, 2] / _MOVED_PX
         result = np.empty((count, 8))
-        at_start = {"stage_mm": 0.0, "stage_direction": np.array([1.0, 0.0, 0.0])}
-        result[:, :3] = to_object(calibration, in_camera, **at_start)
+        result[:, :3] = to_object(calibration, in_camera)
         result[:, 3:6] = per_mm * (sigma**2)[:, None]
         result[:, 6] = sigma
         # On a surface normal to the laser's axis, Z is constant: the shifts of sheet and pixel cancel in Z.

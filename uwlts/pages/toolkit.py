@@ -349,6 +349,6 @@ def format_fixed(value: float | None, decimals: int = 3, *, signed: bool = False
     return text if float(text) else text.lstrip("+-")
 
 
-def format_to_scale(value: float, scale: float, *, digits: int = 3) -> str:
-    """Format a number with as many decimals as a scale with some significant digits has."""
-    return format_fixed(value, max(0, digits - 1 - math.floor(math.log10(scale)) if scale > 0 else 3))
+def format_to_scale(value: float, scale: float) -> str:
+    """Format a number with as many decimals as a scale with two significant digits has."""
+    return format_fixed(value, max(0, 1 - math.floor(math.log10(scale))) if scale > 0 else 3)

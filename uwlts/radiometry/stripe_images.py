@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import special
 from scipy.optimize import minimize_scalar
 from scipy.signal import savgol_filter
 from scipy.special import erf
-from scipy.stats import chi2
 
 from uwlts.errors import CaptureError
 from uwlts.fitting.propagation import jackknife
@@ -299,13 +299,13 @@ def _measure_variance(images: np.ndarray) -> np.ndarray:
     its scale. Kept variances are corrected for those beyond the limit.
     """
     variance, middle, freedom = images.var(axis=0, ddof=1), np.median(images, axis=0), len(images) - 1
-    limit = float(chi2.ppf(_STILL, freedom))
+    limit = float(special.chdtri(freedom, 1 - _STILL))
     above = np.maximum(middle - np.median(middle), 1.0)
     cell = np.digitize(above, np.geomspace(2.0, max(float(above.max()), 4.0), _BINS))
     most = np.array([np.median(variance[cell == k]) if (cell == k).any() else 0.0 for k in range(_BINS + 1)])
-    most = np.maximum(most, _ROUNDING) * limit / float(chi2.median(freedom))
+    most = np.maximum(most, _ROUNDING) * limit / float(special.chdtri(freedom, 0.5))
     kept = variance <= most[cell]
-    return np.where(kept, variance * _STILL / float(chi2.cdf(limit, freedom + 2)), np.nan)
+    return np.where(kept, variance * _STILL / float(special.chdtr(freedom + 2, limit)), np.nan)
 
 
 def _find_repeats(capture: Capture) -> list[np.ndarray]:

@@ -32,7 +32,7 @@ from uwlts.errors import CaptureError
 from uwlts.fitting.local_surface import surface_normals
 from uwlts.model.calibration import Calibration
 from uwlts.model.placement import LaserPose, apparent_depth_mm, laser_pose
-from uwlts.model.sensor import Camera, CaptureHeader, Laser, Sensor, Window
+from uwlts.model.sensor import CaptureHeader, Laser, Sensor, Window
 from uwlts.model.stripe import CaptureStripes, stack_pixels
 from uwlts.optics.camera import directions
 from uwlts.optics.design import WindowGeometry, length_outside_mm, trace_to_points
@@ -120,7 +120,7 @@ def light_at(
         # A ray one pixel further meets the surface at this distance along the ray from its crossing of the sheet.
         shift = -np.vecdot(normal, along) / np.vecdot(normal, ray)
         sheet_per_px = np.abs(slope * shift)
-        grey = _grey_per_radiance(sensor, medium_index) * in_air[:, 2] ** 4 * per_mm * lit / (math.pi * sheet_per_px)
+        grey = _convert_radiance(sensor, medium_index) * in_air[:, 2] ** 4 * per_mm * lit / (math.pi * sheet_per_px)
     across = along - np.vecdot(along, ray)[:, None] * ray
     good = (found.status[:count] == RayStatus.OK) & (found.status[count:] == RayStatus.OK)
     good &= (lit > _GRAZING) & (seen > _GRAZING) & np.isfinite(grey) & (grey > 0)
@@ -149,12 +149,6 @@ def transmission(window: Window, *, wavelength_nm: float, medium_index: float) -
     return faces[0] * faces[1] * math.exp(-window.absorption_per_mm() * window.thickness_mm)
 
 
-def working_f_number(camera: Camera) -> float:
-    """Return the f-number for the magnification m at the described focus: N (1 + m)."""
-    magnified = camera.focal_length_mm / (camera.focus_distance_mm - camera.focal_length_mm)
-    return camera.f_number * (1 + magnified)
-
-
 def defocus_variance(
     sensor: Sensor, calibration: Calibration, depth_mm: np.ndarray, *, medium_index: float
 ) -> np.ndarray:
@@ -163,7 +157,7 @@ def defocus_variance(
     A disc of radius r has the variance r² / 4. Behind the window, depths appear divided by their index.
     """
     camera, window = sensor.camera, calibration.window
-    pupil = 0.5 * camera.focal_length_mm / working_f_number(camera)
+    pupil = 0.5 * camera.focal_length_mm / camera.working_f_number()
     apparent = depth_mm
     if window is not None and camera.window.mounted:
         behind = window.distance_mm, window.thickness_mm
@@ -172,14 +166,14 @@ def defocus_variance(
     return radius**2 / 4
 
 
-def _grey_per_radiance(sensor: Sensor, index: float) -> float:
+def _convert_radiance(sensor: Sensor, index: float) -> float:
     """Return the grey values per ms, and per radiance in the medium in mW / (mm2 sr), on the lens's axis.
 
     The image irradiance is pi / (4 N^2) L with the working f-number N; a radiance falls by the squared index on its way
     to air. Photo-electrons follow from EMVA 1288 release 4, Eq. 4.
     """
     camera, detector, wavelength = sensor.camera, sensor.detector, sensor.laser.wavelength_nm
-    aperture = math.pi / (4 * working_f_number(camera) ** 2)
+    aperture = math.pi / (4 * camera.working_f_number() ** 2)
     area_mm2 = (1e-3 * camera.pixel_size_um) ** 2 / camera.pixel_aspect
     electrons_per_mj = 1e-3 * wavelength / _JOULE_NM * detector.quantum_efficiency
     windows = [

@@ -72,9 +72,9 @@ def estimate_stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.
     starts = np.flatnonzero(np.r_[True, image[1:] != image[:-1], True])
     for start, end in pairwise(starts.tolist()):
         if end - start >= _FEWEST_NEIGHBOURS:
-            noise[image[start]] = scale * _median(off[start:end])
+            noise[image[start]] = scale * _find_median(off[start:end])
     if (few := np.isnan(noise)).any():
-        noise[few] = scale * _median(off)
+        noise[few] = scale * _find_median(off)
     return noise[frame]
 
 
@@ -106,7 +106,7 @@ def _compare_neighbours(
 
 def _correlate(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray, off: np.ndarray) -> float:
     """Return `measure_correlation` of sorted centres (N,) with distances (M,) from the means of two neighbours."""
-    count, usual = 4 * _MEAN_LINES, _median(off)
+    count, usual = 4 * _MEAN_LINES, _find_median(off)
     if len(line) < count or usual <= 0:
         return 1.0
     whole = (frame[count - 1 :] == frame[: 1 - count]) & (line[count - 1 :] - line[: 1 - count] == count - 1)
@@ -114,10 +114,10 @@ def _correlate(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray, off: 
         return 1.0
     weights = np.repeat([1.0, -3.0, 3.0, -1.0], _MEAN_LINES) / _MEAN_LINES
     third = np.abs(np.convolve(centre_px, weights, mode="valid")[whole])
-    return max(1.0, float(np.sqrt(_MEAN_LINES / 20)) * MAD_TO_STD * _median(third) / (_NEIGHBOUR_SCALE * usual))
+    return max(1.0, float(np.sqrt(_MEAN_LINES / 20)) * MAD_TO_STD * _find_median(third) / (_NEIGHBOUR_SCALE * usual))
 
 
-def _median(values: np.ndarray) -> float:
+def _find_median(values: np.ndarray) -> float:
     """Return the median of finite values; several times faster than NumPy's for a few hundred values."""
     middle = [(len(values) - 1) // 2, len(values) // 2]
     low, high = np.partition(values, middle)[middle].tolist()

@@ -356,7 +356,7 @@ def _triangulate(
     """Triangulate stripe centres with any kind of calibration to points in the OCS, moved by the stage."""
     direction = np.array(capture.header.stage_direction)
     # A rolling shutter exposes each row at its own time, and hence at its own position of a moving stage.
-    stage = capture.stage_mm[stripes.frame] + capture.speed_mm_per_s[stripes.frame] * _row_delay_s(capture, stripes)
+    stage = capture.stage_mm[stripes.frame] + capture.speed_mm_per_s[stripes.frame] * _time_rows_s(capture, stripes)
     line, centre = stripes.line, stripes.centre_px
     if isinstance(calibration, PolynomialCalibration):
         return reconstruct_by_polynomials(calibration, line, centre, stage_mm=stage, stage_direction=direction)
@@ -368,7 +368,7 @@ def _triangulate(
     return reconstruct_profile(calibration, line, centre, medium_index=index, stage_mm=stage, stage_direction=direction)
 
 
-def _row_delay_s(capture: Capture | FrameTable, stripes: CaptureStripes) -> np.ndarray | float:
+def _time_rows_s(capture: Capture | FrameTable, stripes: CaptureStripes) -> np.ndarray | float:
     """Return the exposure delay (N,), s, of the rows of stripe centres relative to the central row."""
     camera, detector = capture.header.sensor.camera, capture.header.sensor.detector
     if detector.shutter == "global":
@@ -378,8 +378,8 @@ def _row_delay_s(capture: Capture | FrameTable, stripes: CaptureStripes) -> np.n
 
 
 def _describe_footprint(capture: Capture | FrameTable, sheet: IlluminatedPoints, stripes: CaptureStripes) -> Table:
-    """Return metadata on the footprint of a point on the surface; empty if unknown."""
-    if not np.isfinite(stripes.width_px[sheet.found.status == RayStatus.OK]).any():
+    """Return metadata on the footprint of a point on the surface; empty without a point."""
+    if not (sheet.found.status == RayStatus.OK).any():
         return {}
     std = footprint_std(capture.header.sensor.uncertainty)
     return {FOOTPRINT: list(sheet.footprint_mm(stripes.width_px)), FOOTPRINT_STD: std}

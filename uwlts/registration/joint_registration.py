@@ -168,7 +168,7 @@ class JointRegistration:
             ways = _measure_both_ways(found, a, b) if _count_patches(found, a, b) >= FEWEST_OF_PAIR else []
             shared = [(views[a], views[b], len(views)) for views in common if a in views and b in views]
             if ways or shared:
-                pairs[a, b] = self._pair_evidence(a, b, ways, others, shared)
+                pairs[a, b] = self._gather_evidence(a, b, ways, others, shared)
         return pairs
 
     def find_narrow_overlaps(self, found: dict[tuple[int, int], PatchDistances]) -> tuple[tuple[int, int, int], ...]:
@@ -283,7 +283,7 @@ class JointRegistration:
             pose[:3, :3] = rotation @ pose[:3, :3]
         self.patterns = [z + step[columns] for z, columns in zip(self.patterns, self.pattern_columns, strict=True)]
 
-    def _pair_evidence(
+    def _gather_evidence(
         self,
         a: int,
         b: int,
@@ -302,7 +302,7 @@ class JointRegistration:
             # independent differences.
             each = 1 / (others[source][found.source] * self.patches[source].correlated_count(len(found.source)))
             weight = biweight(found.distance_mm / std) / std**2 * each
-            by_poses = partial(self._derivatives_by_poses, source, target, found.places_mm)
+            by_poses = partial(self._differentiate, source, target, found.places_mm)
             block = np.zeros((len(weight), unknown))
             block[:, : self.unknown_poses] = by_poses(found.normals)
             shifts_there, other = (
@@ -335,7 +335,7 @@ class JointRegistration:
         known = derivatives, residuals, weights, std, spread, spurious
         return PairEvidence(*known, tuple(ways), places, len(relative))
 
-    def _derivatives_by_poses(self, source: int, target: int, places: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    def _differentiate(self, source: int, target: int, places: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Return the derivatives (Q, P), by all poses, of distances between two scans along directions (Q, 3)."""
         block, middles = np.zeros((len(places), self.unknown_poses)), self.middles_mm
         for number, sign in ((source, 1.0), (target, -1.0)):

@@ -313,8 +313,8 @@ def register(
         covariance=covariance,
         middles_mm=joint.middles_mm,
         open_movements=_open_movements(solution.open_directions, joint.middles_mm, joint.sizes),
-        pairs=tuple(_pair_fit(joint, key, pairs, solution) for key in pairs),
-        overlaps=tuple(_overlap(pair) for pair in pairs.values()),
+        pairs=tuple(_summarise_pair(joint, key, pairs, solution) for key in pairs),
+        overlaps=tuple(_measure_overlap(pair) for pair in pairs.values()),
         narrow_overlaps=joint.find_narrow_overlaps(distances),
         scale=float(np.sqrt(np.mean(amounts**2))) if len(amounts) else np.nan,
         cloud=merge_clouds(scans, names, joint, known),
@@ -340,7 +340,7 @@ def _omit_shared_points(scans: Sequence[PointCloud], names: Sequence[str]) -> li
     return result
 
 
-def _pair_fit(
+def _summarise_pair(
     joint: JointRegistration, key: tuple[int, int], pairs: dict[tuple[int, int], PairEvidence], solution: PoseSolution
 ) -> PairFit:
     pair = pairs[key]
@@ -359,7 +359,7 @@ def _pair_fit(
     )
 
 
-def _overlap(pair: PairEvidence) -> Overlap:
+def _measure_overlap(pair: PairEvidence) -> Overlap:
     counted = pair.counted[: pair.patches]
     return Overlap(pair.places_mm[counted], pair.residuals[: pair.patches][counted])
 

@@ -78,7 +78,7 @@ def write_camera(path: str | Path, camera: CameraCalibration, *, overwrite: bool
         rows=rows,
         misses=_plot_residuals(camera),
         pictures=[
-            (each.name, each.reason or "used", _thumbnail(camera, each)) for each in (left_out + used)[:_MOST_PICTURES]
+            (each.name, each.reason or "used", _brighten(camera, each)) for each in (left_out + used)[:_MOST_PICTURES]
         ],
     )
     write_page(path, text, overwrite=overwrite)
@@ -138,7 +138,7 @@ def _plot_residuals(camera: CameraCalibration) -> Markup:
     return figure_svg(figure)
 
 
-def _thumbnail(camera: CameraCalibration, photograph: Photograph) -> str | None:
+def _brighten(camera: CameraCalibration, photograph: Photograph) -> str | None:
     """Return the image, brightened, with the points found; None if it cannot be read."""
     try:
         image = read_image(camera.folder / photograph.name)
@@ -189,7 +189,7 @@ def write_recalibration(path: str | Path, found: Recalibrated, *, overwrite: boo
         ],
         doubts=found.doubts,
         warnings=found.warnings,
-        parameters=list(map(_parameter_row, sorted(found.parameters, key=lambda each: each.std / each.std_before))),
+        parameters=list(map(_show_parameter, sorted(found.parameters, key=lambda each: each.std / each.std_before))),
         mount=found.mount.lines() if found.mount else [],
         next_passes=[
             (each.candidate.words, f"{each.before:.3f}", f"{each.after:.3f}")
@@ -204,7 +204,7 @@ def write_recalibration(path: str | Path, found: Recalibrated, *, overwrite: boo
     write_page(path, text, beside=json_text(found.record()), kind=RECALIBRATION, overwrite=overwrite)
 
 
-def _parameter_row(change: ParameterChange) -> tuple[str, ...]:
+def _show_parameter(change: ParameterChange) -> tuple[str, ...]:
     label = change.key.quantity
     after = label.format_with_std(change.after, change.std) if change.determined else "not determined"
     left = f"{100 * change.std / change.std_before:.0f} %"

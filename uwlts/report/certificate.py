@@ -49,7 +49,7 @@ class ParameterRow(Description):
         """Return value and standard uncertainty as text, rounded to two digits of the uncertainty."""
         if self.std is None or not self.std > 0:
             return f"{self.value:.6g}", MISSING
-        return format_to_scale(self.value, self.std, digits=2), format_to_scale(self.std, self.std, digits=2)
+        return format_to_scale(self.value, self.std), format_to_scale(self.std, self.std)
 
 
 def parameter_rows(calibration: Calibration) -> tuple[ParameterRow, ...]:

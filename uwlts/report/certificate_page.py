@@ -104,11 +104,11 @@ def certificate_page(
         parameters=_list_parameters(content.parameters, before),
         before=None if before is None else before[0],
         lengths=_list_lengths(content.lengths),
-        drawn=_pictures(content, calibration, before),
+        drawn=_draw(content, calibration, before),
     )
 
 
-def _pictures(content: Certificate, calibration: Calibration, before: tuple[str, Calibration] | None) -> dict[str, Any]:
+def _draw(content: Certificate, calibration: Calibration, before: tuple[str, Calibration] | None) -> dict[str, Any]:
     """Return the charts of the page by name.
 
     ``worst`` are the images with the largest residuals relative to their kind.
@@ -142,7 +142,7 @@ def _list_parameters(rows: Sequence[ParameterRow], before: tuple[str, Calibratio
     other = {} if before is None else {row.name: row for row in parameter_rows(before[1])}
     shown = []
     for row in rows:
-        known = MISSING if row.std_before is None else format_to_scale(row.std_before, row.std_before, digits=2)
+        known = MISSING if row.std_before is None else format_to_scale(row.std_before, row.std_before)
         theirs = other.pop(row.name, None)
         shown.append((row.words, row.unit, *row.texts(), known, *(theirs.texts() if theirs else (MISSING, MISSING))))
     return shown + [(row.words, row.unit, MISSING, MISSING, MISSING, *row.texts()) for row in other.values()]

@@ -199,7 +199,7 @@ def capture_lines(capture: Capture) -> list[str]:
     laser = int(capture.laser_on.sum())
     lines = [
         f"capture of the sensor '{header.sensor.name}' in {header.medium_name} "
-        f"({_medium(header.medium, header.sensor)})",
+        f"({_describe(header.medium, header.sensor)})",
         f"{len(capture)} frames of {camera.width_px} x {camera.height_px} pixels, {laser} with the laser on"
         + ("" if capture.finished else "; the recording was interrupted"),
     ]
@@ -221,7 +221,7 @@ def truth_lines(header: TruthHeader, truth: Truth) -> list[str]:
     frames, lines = truth.status.shape
     visible = int(np.count_nonzero(truth.status == TruthStatus.VISIBLE))
     return [
-        f"ground truth of the sensor '{header.sensor.name}' ({_medium(header.medium, header.sensor)})",
+        f"ground truth of the sensor '{header.sensor.name}' ({_describe(header.medium, header.sensor)})",
         f"{frames} frames of {lines} profile lines, {visible} of them show the stripe",
     ]
 
@@ -362,12 +362,12 @@ def mount_lines(mount: Mount) -> list[str]:
     found = mount.artefact
     if isinstance(found, BoardFound):
         x, y, z = (row[3] for row in found.T_base_target[:3])
-        lines.append(f"target, mm                origin at {_vector((x, y, z))}")
+        lines.append(f"target, mm                origin at {_format((x, y, z))}")
     elif isinstance(found, SphereFound):
         known = within(found.radius_std_mm)
-        lines.append(f"sphere, mm                at {_vector(found.centre_mm)}, radius {found.radius_mm:.3f} ({known})")
+        lines.append(f"sphere, mm                at {_format(found.centre_mm)}, radius {found.radius_mm:.3f} ({known})")
     else:
-        lines.append(f"plane                     normal {_vector(found.normal)}, distance {found.distance_mm:.3f} mm")
+        lines.append(f"plane                     normal {_format(found.normal)}, distance {found.distance_mm:.3f} mm")
     if mount.robot_scale is not None and mount.robot_scale_std is not None:
         half_scale = mount.coverage_factor * mount.robot_scale_std
         lines.append(f"robot's scale             {mount.robot_scale:.6f} +-{half_scale:.6f}")
@@ -388,7 +388,7 @@ def mount_lines(mount: Mount) -> list[str]:
     return lines
 
 
-def _vector(values: tuple[float, float, float]) -> str:
+def _format(values: tuple[float, float, float]) -> str:
     return f"({', '.join(f'{value:.3f}' for value in values)})"
 
 
@@ -446,7 +446,7 @@ def sensor_lines(sensor: Sensor) -> list[str]:
     for name, medium in sensor.media.items():
         view = check_design(sensor, medium)
         lines.append(
-            f"{name} ({_medium(medium, sensor)}): stand-off {view.standoff_mm:.1f} mm outside the window, sheet in "
+            f"{name} ({_describe(medium, sensor)}): stand-off {view.standoff_mm:.1f} mm outside the window, sheet in "
             f"view from {view.nearest_mm:.1f} to {view.farthest_mm:.1f} mm"
         )
         for along, side in (("width", sensor.camera.width_px), ("height", sensor.camera.height_px)):
@@ -458,7 +458,7 @@ def sensor_lines(sensor: Sensor) -> list[str]:
     return lines
 
 
-def _medium(medium: Medium, sensor: Sensor) -> str:
+def _describe(medium: Medium, sensor: Sensor) -> str:
     index = medium.refractive_index(sensor.laser.wavelength_nm)
     water = f", {medium.temperature_c:g} degC, {medium.salinity_g_kg:g} g/kg" if medium.kind in ("fresh", "sea") else ""
     return f"{medium.kind}, n {index:.5f}{water}"

@@ -271,8 +271,8 @@ def _check_row(figure: Figure) -> tuple[str, ...]:
     expanded = figure.expanded_uncertainty_mm
     fine = expanded or _SMALLEST_MM
     calibrated = MISSING if figure.calibrated_mm is None else f"{figure.calibrated_mm:g}"
-    stated = MISSING if expanded is None else format_to_scale(expanded, fine, digits=2)
-    return figure.key.name.replace("_", " "), calibrated, format_to_scale(figure.value_mm, fine, digits=2), stated
+    stated = MISSING if expanded is None else format_to_scale(expanded, fine)
+    return figure.key.name.replace("_", " "), calibrated, format_to_scale(figure.value_mm, fine), stated
 
 
 def _render(
@@ -315,7 +315,7 @@ def _render(
         by_hand=None if by_hand is None else (COLUMNS, [each.row() for each in by_hand.values]),
         maps=_make_maps(found, cloud, parts, order),
         accuracy=_state_point_accuracy(cloud),
-        depths=[format_to_scale(each, each, digits=2) for each in dict.fromkeys((*depths[:1], *depths[-1:]))],
+        depths=[format_to_scale(each, each) for each in dict.fromkeys((*depths[:1], *depths[-1:]))],
         pictures=[
             (each.title, judge_feature(each, order.limits)[0], _plot_finding(each, found, cloud)) for each in drawn
         ],
@@ -353,15 +353,10 @@ def _list_findings(
     listed: Sequence[Feature], found: Inspection, cloud: PointCloud, order: FindingOrder
 ) -> tuple[tuple[str, ...], list[tuple[str, tuple[str, ...]]]]:
     """Return headings and rows of the first page: verdict, and texts on verdict, place and size of every finding."""
-    whole = found.features[0]
-    start = cloud.points_mm.min(axis=0)
-    if whole.kind == FeatureKind.PIPE:
-        start = cloud.points_mm[int(np.argmin(cloud.points_mm @ resolve_datum(order.datum, whole.axes[2])[0]))]
-    clock = "clock" if whole.kind == FeatureKind.PIPE else "place / mm"
-    rows = []
+    whole, rows = found.features[0], []
     for each in listed:
         verdict, names = judge_feature(each, order.limits)
-        at = format_place(each, whole, start, order.datum) if each is not whole else (MISSING, MISSING)
+        at = format_place(each, whole, cloud.points_mm, order.datum) if each is not whole else (MISSING, MISSING)
         size = {value.name: format_interval(value) for value in each.values}
         first = next(iter(names), each.values[0].name)
         said = f"{verdict} ({', '.join(names)})" if names else verdict
@@ -369,7 +364,7 @@ def _list_findings(
         main = next((size[name] for name in _MAIN if name in size), f"{first} {size[first]}")
         more = tuple(size.get(name, MISSING) for name in ("remaining wall", "length", "width"))
         rows.append((verdict, (each.title, said, *at, main, *more)))
-    heads = "finding", "verdict", clock, "from datum / mm", "depth or height / mm"
+    heads = "finding", "verdict", "clock", "from datum / mm", "depth or height / mm"
     return (*heads, "remaining wall / mm", "length / mm", "width / mm"), rows
 
 
@@ -378,24 +373,19 @@ def format_interval(value: FeatureValue) -> str:
     half = COVERAGE_FACTOR * value.uncertainty
     if value.bound:
         text, number = value.bound
-        return f"{text} {format_to_scale(number, max(half, _SMALLEST_MM), digits=2)}"
+        return f"{text} {format_to_scale(number, max(half, _SMALLEST_MM))}"
     if half <= _SMALLEST:
         return f"{value.value:.4g}"
-    shown = format_to_scale(value.value, half, digits=2)
+    shown = format_to_scale(value.value, half)
     if value.low > value.value - 0.9 * half:
         # The interval of a non-negative value is asymmetric.
-        return (
-            f"{shown} ({format_to_scale(value.low, half, digits=2)} to {format_to_scale(value.high, half, digits=2)})"
-        )
-    return f"{shown} ± {format_to_scale(half, half, digits=2)}"
+        return f"{shown} ({format_to_scale(value.low, half)} to {format_to_scale(value.high, half)})"
+    return f"{shown} ± {format_to_scale(half, half)}"
 
 
 def _make_value_row(value: FeatureValue) -> tuple[str, ...]:
     parts = value.random, value.systematic
-    fine = [
-        MISSING if part is None else format_to_scale(part, part, digits=2) if part > _SMALLEST else "0"
-        for part in parts
-    ]
+    fine = [MISSING if part is None else format_to_scale(part, part) if part > _SMALLEST else "0" for part in parts]
     return value.name, value.unit, format_interval(value), *fine
 
 
@@ -422,8 +412,8 @@ def _make_maps(
     pipe = next((each for each in found.features if each.kind == FeatureKind.PIPE), None)
     labels = ["X / mm", "Y / mm"] if pipe is None else ["along the axis / mm", "around the circumference / mm"]
     middle = cloud.points_mm.mean(axis=0)
-    at = _map_coordinates(cloud.points_mm, pipe, middle)
-    marks = _map_coordinates(np.array([each.place_mm for each in parts]).reshape(-1, 3), pipe, middle)
+    at = _compute_map_coordinates(cloud.points_mm, pipe, middle)
+    marks = _compute_map_coordinates(np.array([each.place_mm for each in parts]).reshape(-1, 3), pipe, middle)
     ends = [(side.min(), side.max()) for side in at]
     if pipe:
         ends[1] = -np.pi * pipe["diameter"].value / 2, np.pi * pipe["diameter"].value / 2
@@ -440,7 +430,7 @@ def _make_maps(
     height = 7.2 * float(np.ptp(at[1]) / max(np.ptp(at[0]), 1e-9))
     figure, (axes,) = new_figure(8.0, height + 1.5)
     size = float(np.clip(1.5 * height * 7.2 * 72**2 / max(len(shown), 1), 1, 60))
-    colours = axes.scatter(*at[:, shown], c=found.deviation_mm[shown], rasterized=True, s=size, **_colour_scale(found))
+    colours = axes.scatter(*at[:, shown], c=found.deviation_mm[shown], rasterized=True, s=size, **_scale_colour(found))
     figure.colorbar(colours, ax=axes, label="above the undamaged surface / mm", orientation="horizontal", aspect=50)
     for each, place in zip(parts, marks.T, strict=True):
         colour = _VERDICT_COLOURS[judge_feature(each, order.limits)[0]]
@@ -464,7 +454,7 @@ def _make_maps(
     return png_data_uri(figure, dpi=130), png_data_uri(seen, dpi=110), said
 
 
-def _colour_scale(found: Inspection) -> dict[str, Any]:
+def _scale_colour(found: Inspection) -> dict[str, Any]:
     """Return the one scale of the map and of all pictures of findings."""
     limit = surface_limit_mm(found.deviation_mm)
     return {"cmap": DEVIATIONS, "vmin": -limit, "vmax": limit, "linewidths": 0}
@@ -480,10 +470,10 @@ def _state_point_accuracy(cloud: PointCloud) -> list[str] | None:
         return None
     every = COVERAGE_FACTOR * np.hypot(random, common)
     typical = [float(np.median(each)) for each in (every, COVERAGE_FACTOR * random, COVERAGE_FACTOR * common)]
-    return [format_to_scale(each, typical[0], digits=2) for each in (*typical, float(np.quantile(every, COVERAGE)))]
+    return [format_to_scale(each, typical[0]) for each in (*typical, float(np.quantile(every, COVERAGE)))]
 
 
-def _map_coordinates(points: np.ndarray, pipe: Feature | None, middle: np.ndarray) -> np.ndarray:
+def _compute_map_coordinates(points: np.ndarray, pipe: Feature | None, middle: np.ndarray) -> np.ndarray:
     """Return map coordinates (2, N) of points: along and around a pipe, centred at ``middle`` (3,), else X and Y."""
     if pipe is None:
         return points[:, :2].T
@@ -503,7 +493,7 @@ def _plot_finding(feature: Feature, found: Inspection, cloud: PointCloud) -> str
     local, deviation = local[near], found.deviation_mm[near]
     figure, (above, cut) = new_figure(7.4, 2.4, columns=2)
     size = float(np.clip(25_000 / max(len(local), 1), 2, 40))
-    colours = above.scatter(local[:, 0], local[:, 1], c=deviation, s=size, **_colour_scale(found))
+    colours = above.scatter(local[:, 0], local[:, 1], c=deviation, s=size, **_scale_colour(found))
     figure.colorbar(colours, ax=above, label="deviation / mm")
     for other in found.select(*BLEMISHES):
         outline = (other.outline_mm - feature.place_mm) @ feature.axes.T

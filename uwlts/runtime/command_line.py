@@ -136,7 +136,7 @@ class DerivedCommand:
         self._package, self._function, self._also, self._shortcuts = package, function, also, shortcuts
         self._body = body
         self.__name__ = body.__name__
-        prose = summary or _convert_help(_sections(docstring(package, function))[0], descriptions(package, function))
+        prose = summary or _convert_help(_split(docstring(package, function))[0], descriptions(package, function))
         self.__doc__ = f"{prose.rstrip()}\n\n{inspect.getdoc(body)}"
 
     @property
@@ -299,7 +299,7 @@ def parse_settings(option: str, texts: Sequence[str]) -> dict[str, Any]:
 def descriptions(package: ModuleType, function: str) -> dict[str, str]:
     """Return the descriptions of parameters in a docstring; "As for `package.other`" refers to that function's."""
     found = {}
-    sections = _sections(docstring(package, function))
+    sections = _split(docstring(package, function))
     parameters = dict(zip(sections[1::2], sections[2::2], strict=True)).get("Parameters", "")
     for listed, block in re.findall(r"^(\*?\w.*)\n((?:    .*\n?|\n(?=    ))+)", parameters, flags=re.MULTILINE):
         other = re.match(r"\s*As for `(?:(\w+)\.)?(\w+)`", block)
@@ -314,7 +314,7 @@ def _convert_help(text: str, names: Collection[str]) -> str:
     return replace_by_options(text, names).replace("`", "")
 
 
-def _sections(text: str) -> list[str]:
+def _split(text: str) -> list[str]:
     """Split a docstring into its prose, and then titles and texts of its sections in turn."""
     return re.split(r"^(\w+)\n-+\n", f"{text}\n", flags=re.MULTILINE)
 

@@ -20,9 +20,9 @@ from uwlts.storage.capture import (
     CAPTURES,
     COVARIANCE,
     FORMAT,
-    MORE,
     PER_FRAME,
     POSE_ROUNDED,
+    SPEED,
     VERSION,
     Capture,
     Frame,
@@ -69,7 +69,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         self._frame_bytes = camera.height_px * camera.width_px * self._dtype.itemsize
         self._moving = moving
         self._columns: dict[str, tuple[tuple[int, ...], type]] = {COVARIANCE: ((6, 6), float)} if covariances else {}
-        self._columns |= MORE if moving else {}
+        self._columns |= {SPEED: ((), float)} if moving else {}
         # The time is written last: its length is the number of frames.
         self._columns |= PER_FRAME
         if self._dtype not in (np.uint8, np.uint16):
@@ -88,7 +88,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             self._file = h5py.File(self._part, "r+", libver="latest", locking=False)
             self._file.swmr_mode = True
             self._locked = _lock(self._part)
-            self._arrays = _arrays(self._file)
+            self._arrays = _list_data_sets(self._file)
 
     def _open_part(self) -> "Capture":
         """Open the unfinished recording to continue; raises CaptureError if it is not one of this capture."""
@@ -136,7 +136,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
                     # No checksum: if a kill interrupts the rewriting of a chunk, it would lose 256 rows instead of the
                     # last one.
                     self._file.create_dataset(name, (0, *shape), kind, maxshape=(None, *shape), chunks=chunks)
-                self._arrays = _arrays(self._file)
+                self._arrays = _list_data_sets(self._file)
                 for frame in unfinished:
                     self._store(frame)
             truncate(fresh)
@@ -256,7 +256,7 @@ def _dump_recording(header: CaptureHeader, dtype: np.dtype, plan: Table | None, 
     return {"plan": plan, "images": f"{dtype}{', moving' if moving else ''}", "header": header.model_dump(mode="json")}
 
 
-def _arrays(file: h5py.File) -> dict[str, h5py.Dataset]:
+def _list_data_sets(file: h5py.File) -> dict[str, h5py.Dataset]:
     """Return the datasets of a capture by name."""
-    names = ("frames", "stage_reports", *MORE, COVARIANCE, *PER_FRAME)
+    names = ("frames", "stage_reports", SPEED, COVARIANCE, *PER_FRAME)
     return {name: cast(h5py.Dataset, file[name]) for name in names if name in file}

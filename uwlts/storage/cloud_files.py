@@ -36,7 +36,7 @@ from uwlts.storage.foreign_clouds import FORMATS, find_format
 from uwlts.storage.hdf5_file import DAMAGE, find_dataset, read_array, read_format, read_label, write_arrays
 from uwlts.storage.las_file import load_library
 from uwlts.storage.number_tables import Unit, choose_scale, find_stated_unit
-from uwlts.storage.ply import encode_ply, read_comments, read_ply
+from uwlts.storage.ply import encode_ply, read_ply
 from uwlts.storage.repeated_points import omit_repeated
 
 FORMAT = "uwlts-cloud"
@@ -205,13 +205,16 @@ def read_thinned_cloud(
     """
     with _name_errors(path):
         if (form := find_format(path)) is not None:
+            if form.unit is not None:
+                _refuse_other_unit(path, unit)
             whole = form.read(Path(path), unit)
             cloud, total = whole.select(_choose_rows(len(whole), at_most)), len(whole)
         else:
-            cloud, total = _read_rows(Path(path), lambda count: _choose_rows(count, at_most))
+            cloud, total = _read_rows(Path(path), lambda count: _choose_rows(count, at_most), unit)
         if not len(cloud) and cloud.warnings:
             raise CaptureError(f"no point is left: {'; '.join(cloud.warnings)}")
-        return _convert_to_mm(cloud, path, unit), total
+    log_warnings(path, cloud.warnings)
+    return cloud, total
 
 
 def read_region(
@@ -251,8 +254,8 @@ def read_parts(
     start, total = 0, 1
     while start < total:
         with _name_errors(path):
-            part, total = _read_rows(Path(path), lambda _, start=start: slice(start, start + most))
-            part = _convert_to_mm(part, path, unit)
+            part, total = _read_rows(Path(path), lambda _, start=start: slice(start, start + most), unit)
+        log_warnings(path, part.warnings)
         yield part
         start += most
 
@@ -263,27 +266,13 @@ def unit_of(path: str | os.PathLike[str]) -> Unit:
     return "mm" if form is None or form.unit is None else form.unit
 
 
-def _convert_to_mm(cloud: PointCloud, path: str | os.PathLike[str], unit: Unit | None) -> PointCloud:
-    """Convert a cloud from ``unit`` to mm, note the step of its numbers, and log its warnings.
-
-    Raises CaptureError if its file states another unit.
-    """
-    form = find_format(path)
-    # Foreign formats without a prescribed unit were converted when they were read.
-    if form is None or form.unit is not None:
-        of_program = _is_hdf5(path) or bool(cloud.metadata.keys() - {STEP}) or cloud.uncertainty is not None
-        stated = unit_of(path) if of_program or form is not None else None
-        if unit is not None and stated not in (None, unit):
-            raise CaptureError(
-                f"{path} is in {stated}, as its format prescribes, but the unit {unit} was given: omit it"
-            )
-        if Path(path).suffix.lower() == ".ply":
-            named, doubts = ("mm", []) if of_program else find_stated_unit(read_comments(Path(path)))
-            scale, step = choose_scale(named, unit, Path(path), CaptureError), find_float_step(cloud.points_mm)
-            known = replace(cloud, points_mm=scale * cloud.points_mm, warnings=[*doubts, *cloud.warnings])
-            cloud = note_step(known, scale * step)
-    log_warnings(path, cloud.warnings)
-    return cloud
+def _refuse_other_unit(path: str | os.PathLike[str], unit: Unit | None) -> None:
+    """Raise CaptureError if a file's format prescribes another unit than the given one."""
+    prescribed = unit_of(path)
+    if unit not in (None, prescribed):
+        raise CaptureError(
+            f"{path} is in {prescribed}, as its format prescribes, but the unit {unit} was given: omit it"
+        )
 
 
 @contextmanager
@@ -295,13 +284,16 @@ def _name_errors(path: str | os.PathLike[str]) -> Iterator[None]:
         raise CaptureError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
 
 
-def _read_rows(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
+def _read_rows(path: Path, rows: _Rows, unit: Unit | None) -> tuple[PointCloud, int]:
     """Read selected rows of a file, and the number of all; ``rows`` selects them by that number."""
-    if path.suffix.lower() not in (".ply", ".h5"):
+    if _is_hdf5(path):
+        _refuse_other_unit(path, unit)
+        return _read_hdf5(path, rows)
+    if path.suffix.lower() != ".ply":
         with open_regular(path, called="cloud") as file:
             if not file.read(4).startswith(b"ply"):
                 raise CaptureError(f"{path} ends with none of {', '.join(CLOUD_ENDINGS)}, the formats of clouds")
-    return _read_hdf5(path, rows) if _is_hdf5(path) else _read_ply(path, rows)
+    return _read_ply(path, rows, unit)
 
 
 def _choose_rows(count: int, at_most: int | None) -> slice:
@@ -417,7 +409,7 @@ def _read_uncertainty(names: Mapping[str, str], column: Callable[[str], np.ndarr
     return PointUncertainty(random, position, np.stack(patterns), poses_mm=poses)
 
 
-def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
+def _read_ply(path: Path, rows: _Rows, unit: Unit | None) -> tuple[PointCloud, int]:
     try:
         whole, comments = read_ply(path, "vertex", called="cloud")
     except (OSError, MemoryError) as error:
@@ -459,8 +451,14 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
 
     deviation = column("deviation", np.nan)
     metadata, uncertainty = _split_shared(_read_metadata(comments), uncertainty)
+    named, doubts = "mm", list[str]()
+    if metadata.keys() - {STEP} or uncertainty is not None:
+        _refuse_other_unit(path, unit)
+    else:
+        named, doubts = find_stated_unit(comments)
+    scale = choose_scale(named, unit, path, CaptureError)
     cloud = PointCloud(
-        points_mm=points,
+        points_mm=scale * points,
         intensity=column("intensity", np.nan),
         frame=indices("frame"),
         line=indices("line"),
@@ -470,9 +468,9 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
         random_std_mm=lean("random_std"),
         common_std_mm=lean("common_std"),
         metadata=metadata,
-        warnings=warnings,
+        warnings=[*doubts, *warnings],
     )
-    return cloud, len(whole)
+    return note_step(cloud, scale * find_float_step(points)), len(whole)
 
 
 class _CloudHeader(Description):

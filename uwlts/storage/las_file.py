@@ -164,7 +164,7 @@ def read_las(path: Path, unit: Unit | None = None) -> PointCloud:
                     _require_sound_items(header)
                 found = reader.read_points(header.point_count)
             file.seek(header.start_of_first_evlr)
-            system = describe_units(*_system(header, file.read(_LONGEST_SYSTEM) if header.number_of_evlrs else b""))
+            system = describe_units(*_decode(header, file.read(_LONGEST_SYSTEM) if header.number_of_evlrs else b""))
         points = np.column_stack([found.x, found.y, found.z])
         _require_in_box(1e3 * points, header)
         names = set(found.point_format.dimension_names)
@@ -196,7 +196,7 @@ def read_las(path: Path, unit: Unit | None = None) -> PointCloud:
     return replace(cloud, warnings=[*system.notes, *cloud.warnings])
 
 
-def _system(header: Any, behind: bytes) -> tuple[str, dict[int, int]]:
+def _decode(header: Any, behind: bytes) -> tuple[str, dict[int, int]]:
     """Return the coordinate system as WKT, also from the records ``behind`` the points, and as keys of GeoTIFF."""
     texts = [record.string for record in header.vlrs.get("WktCoordinateSystemVlr")]
     if match := _WKT.search(behind):
@@ -303,8 +303,8 @@ def _require_in_box(points_mm: np.ndarray, header: Any) -> None:
     unreachable = (np.abs(stated) > 2**31 * step + margin).any()
     if beyond or unreachable or _is_scaled(stated, found, margin, step):
         raise ValueError(
-            f"its scale or offset is wrong: points are from {_numbers(found_low)} to {_numbers(found_high)} mm, the "
-            f"box of its header from {_numbers(low)} to {_numbers(high)} mm"
+            f"its scale or offset is wrong: points are from {_format(found_low)} to {_format(found_high)} mm, the "
+            f"box of its header from {_format(low)} to {_format(high)} mm"
         )
 
 
@@ -319,7 +319,7 @@ def _is_scaled(stated: np.ndarray, found: np.ndarray, margin: np.ndarray, step: 
     return False
 
 
-def _numbers(values: np.ndarray) -> str:
+def _format(values: np.ndarray) -> str:
     """Return numbers in a few digits, in brackets."""
     return f"({', '.join(f'{value:.5g}' for value in values.tolist())})"
 

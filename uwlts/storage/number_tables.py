@@ -188,7 +188,7 @@ def read_number_table(path: Path, *, named: bool = True) -> NumberTable:
             f"{path} has cells such as '00' between commas: commas seem to be both decimal and separators. "
             "Export it with another separator"
         )
-    names, units = _names_and_units(cells, path)
+    names, units = _find_names_and_units(cells, path)
     if not names:
         names = ["x", "z"] if named and count == 2 else [str(number) for number in range(count)]
     if len(set(names)) < len(names):
@@ -203,11 +203,11 @@ def read_number_table(path: Path, *, named: bool = True) -> NumberTable:
     notes = ["commas between digits were read as decimal commas, blanks as separators"] * (comma and delimiter == b" ")
     if block:
         notes.append(
-            f"lines before the names of columns are omitted ({len(block)}): {shorten(_text(block[0]), 60)} ..."
+            f"lines before the names of columns are omitted ({len(block)}): {shorten(_read(block[0]), 60)} ..."
         )
-    stated, doubts = find_stated_unit(map(_text, [*block, *comments[:1000]]))
+    stated, doubts = find_stated_unit(map(_read, [*block, *comments[:1000]]))
     notes += doubts if not units.keys() & set("xyz") else []
-    decimals = [_decimals(row) for row in zip(*(_split(line, delimiter) for line in lines[:_FIRST]), strict=False)]
+    decimals = map(_count_decimals, zip(*(_split(line, delimiter) for line in lines[:_FIRST]), strict=False))
     steps = {name: 10.0**-count for name, count in zip(names, decimals, strict=False) if count is not None}
     return NumberTable(path, columns, units, steps, notes, stated, directions, ", ".join(cells or names))
 
@@ -229,7 +229,7 @@ def _parse(body: bytes, names: list[str], delimiter: bytes, comma: bool, path: P
     return {name: table[name].to_numpy(zero_copy_only=False).astype(np.float64) for name in names}
 
 
-def _names_and_units(cells: list[str], path: Path) -> tuple[list[str], dict[str, str]]:
+def _find_names_and_units(cells: list[str], path: Path) -> tuple[list[str], dict[str, str]]:
     """Return the usual names of columns, and the units that they state; raises DescriptionError for unknown ones."""
     names: list[str] = []
     units: dict[str, str] = {}
@@ -278,7 +278,7 @@ def _spell_directions(names: list[str]) -> list[str]:
 
 def _is_unit_row(line: bytes) -> bool:
     """Return whether the cells of a line are units or empty."""
-    cells = [_strip_unit(cell) for cell in re.split(r"[,;\t]" if re.search(rb"[,;\t]", line) else r"\s+", _text(line))]
+    cells = [_strip_unit(cell) for cell in re.split(r"[,;\t]" if re.search(rb"[,;\t]", line) else r"\s+", _read(line))]
     return any(cells) and all(not cell or cell in _UNITS for cell in cells)
 
 
@@ -358,7 +358,7 @@ def _split(line: bytes, delimiter: bytes = b"") -> list[bytes]:
     return line.split() if delimiter == b" " else line.split(delimiter)
 
 
-def _decimals(cells: Iterable[bytes]) -> int | None:
+def _count_decimals(cells: Iterable[bytes]) -> int | None:
     """Return the largest number of decimals; None if a number has an exponent, or too few rows show it."""
     found = [_NUMBER.fullmatch(cell.strip().strip(b'"')) for cell in cells]
     known = [len(match[1] or b"") for match in found if match]
@@ -375,14 +375,14 @@ def _is_number(text: bytes) -> bool:
 
 def _name_cells(line: bytes, delimiter: bytes, count: int) -> list[str]:
     """Return the names in a line, separated like the numbers or, if their count differs then, in another way."""
-    text = re.sub(r"\s+(?=[\[(<])", "", re.sub(r"^(?:#|//|%|!)+\s*", "", _text(line)))
+    text = re.sub(r"\s+(?=[\[(<])", "", re.sub(r"^(?:#|//|%|!)+\s*", "", _read(line)))
     mark = delimiter.decode()
     ways = [text.split(mark) if mark != " " else text.split(), re.split(r"[,;\t]", text), re.split(r"[,;\s]+", text)]
     found = next((cells for cells in ways if len(cells) == count), ways[0])
     return [cell.strip().strip('"').strip() for cell in found]
 
 
-def _text(line: bytes) -> str:
+def _read(line: bytes) -> str:
     try:
         return line.decode()
     except UnicodeDecodeError:

@@ -246,7 +246,7 @@ def direct_stripe_in(image: np.ndarray, *, stripe_along: str, options: StripeOpt
     return found.complete(stripe)
 
 
-def leave_ends_out(stripe: Stripe, options: StripeOptions) -> Stripe:
+def _leave_ends_out(stripe: Stripe, options: StripeOptions) -> Stripe:
     """Return the stripe without its last lines before an end or a jump; see `StripeOptions.end_lines`.
 
     The omitted lines have the status END. A stripe ends if more than two consecutive lines lack a centre. The border
@@ -382,7 +382,7 @@ class _SearchedImage:
 
     def complete(self, stripe: Stripe) -> Stripe:
         """Return the stripe without its ends, with the centres of `StripeOptions.low_pass` if it is set."""
-        stripe, tolerance = leave_ends_out(stripe, self.options), self.options.low_pass
+        stripe, tolerance = _leave_ends_out(stripe, self.options), self.options.low_pass
         if tolerance is None:
             return stripe
         return fit_low_passed(self.profiles, stripe, tolerance=tolerance, fitted_px=self.options.low_pass_fit_px)

@@ -262,12 +262,12 @@ class CircleGridTarget(Target):
         # Imported late: a description does not need it.
         from scipy.signal import fftconvolve
 
-        here, fits = _mask(self.indices), []
+        here, fits = _make_mask(self.indices), []
         for _ in range(4):
             numbers = np.column_stack([-numbers[:, 1], numbers[:, 0]])
             low = numbers.min(axis=0)
             # Element s of the correlation counts the circles in the grid after a shift by s.
-            counts = np.rint(fftconvolve(here, _mask(numbers - low)[::-1, ::-1])).astype(int)
+            counts = np.rint(fftconvolve(here, _make_mask(numbers - low)[::-1, ::-1])).astype(int)
             shifts = np.argwhere(counts == counts.max()) - (np.ptp(numbers, axis=0))
             fits.append((int(counts.max()), [numbers - low + shift for shift in shifts]))
         most = max(count for count, _ in fits)
@@ -287,7 +287,7 @@ class CircleGridTarget(Target):
         return max((places[0] for places in best), key=lambda indices: _find_direction(indices, centres))
 
 
-def _mask(places: np.ndarray) -> np.ndarray:
+def _make_mask(places: np.ndarray) -> np.ndarray:
     """Return an array that is 1 at these places (N, 2), counted from 0, and 0 elsewhere."""
     mask = np.zeros(places.max(axis=0) + 1)
     mask[tuple(places.T)] = 1.0

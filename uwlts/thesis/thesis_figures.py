@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from uwlts.calibration.capture_evidence import step_evidence
 from uwlts.calibration.sequential.step_images import StepImage, label_step, solve_window
@@ -53,7 +53,7 @@ def combine(sources: Sequence[UncertaintySource], *, coverage_probability: float
     freedom = 1 / spread if spread > 0 else math.inf
     # Rounding errors must not turn 5 degrees of freedom into 4.
     whole = math.floor(freedom * (1 + 1e-9)) if math.isfinite(freedom) else math.inf
-    expanded = float(stats.t.ppf((1 + coverage_probability) / 2, whole)) * total
+    expanded = float(special.stdtrit(whole, (1 + coverage_probability) / 2)) * total
     correction = sum(source.correction for source in sources)
     figures = {"degrees_of_freedom": freedom, "expanded": expanded, "correction": correction}
     return figures | {"largest_error": abs(correction) + expanded}
@@ -195,9 +195,7 @@ def mm_per_px(calibration: Calibration, medium_index: float) -> float:
     camera = calibration.camera
     across = np.array([0.0, 0.5] if calibration.stripe_along == "width" else [0.5, 0.0])
     pixels = np.array([camera.cx_px, camera.cy_px]) + np.array([-across, across])
-    points = reconstruct_pixels(
-        calibration, pixels, medium_index=medium_index, stage_mm=0.0, stage_direction=np.array([1.0, 0.0, 0.0])
-    ).points_mm
+    points = reconstruct_pixels(calibration, pixels, medium_index=medium_index).points_mm
     return float(abs(points[1, 2] - points[0, 2]))
 
 
@@ -263,7 +261,7 @@ def _measure(
         if scans:
             yield name, "mean SSE", error_mm
     if len(scans) > 1:
-        deviation = max(_spread_mm(capture, calibration) for capture in spheres)
+        deviation = max(_find_spread_mm(capture, calibration) for capture in spheres)
         budget = spacing_budget(calibration, scans, spheres[0].header.medium, deviation_mm=deviation)
         yield from ((BUDGET, name, value) for name, value in budget.items() if math.isfinite(value))
     for capture in lines:
@@ -272,7 +270,7 @@ def _measure(
         yield capture.path.stem, "line length", float(np.ptp(cloud.points_mm[:, 1]))
 
 
-def _spread_mm(capture: Capture, calibration: Calibration) -> float:
+def _find_spread_mm(capture: Capture, calibration: Calibration) -> float:
     """Return the largest standard deviation of points about the spheres of a scan, with the thesis's stripes."""
     stripes = find_stripes(capture, options=_LOW_PASS)
     standard = SphereStandard.model_validate(capture.header.artefact)

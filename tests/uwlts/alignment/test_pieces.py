@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from uwlts.alignment.pieces import _time_gradients, correct_places
+from uwlts.alignment.pieces import _fit_time_gradients, correct_places
 
 
 def test_time_gradients_are_those_of_a_plane_and_of_lonely_patches_zero() -> None:
@@ -14,7 +14,7 @@ def test_time_gradients_are_those_of_a_plane_and_of_lonely_patches_zero() -> Non
     gradient = 0.02 * first - 0.01 * np.cross(normal, first)
     lonely, pair = np.array([[100.0, 0, 0]]), np.array([[200.0, 0, 0], [200.01, 0, 0]])
     times = np.concatenate([5 + places @ gradient, [3.0], [1.0, 1.5]])
-    found = _time_gradients(np.vstack([places, lonely, pair]), times, 3.0)
+    found = _fit_time_gradients(np.vstack([places, lonely, pair]), times, 3.0)
     # The ridge is 1e-6 of the neighbours' sum of squares.
     np.testing.assert_allclose(found[:400], np.broadcast_to(gradient, (400, 3)), atol=1e-4 * 0.02)
     np.testing.assert_array_equal(found[400], 0.0)

@@ -13,11 +13,11 @@ def test_live_images_with_the_laser_end_without_an_operators_page(monkeypatch):
         monkeypatch.setattr(device, "_switches_laser", lambda: True)
         device.attend()
         device.light = "laser"
-        device._preview()
+        device._show_preview()
         assert device.light == "laser"
         monkeypatch.setattr(instrument, "_UNATTENDED_S", -1.0)
-        device._preview()
+        device._show_preview()
         assert device.light is None
         device.light = "lamp"
-        device._preview()
+        device._show_preview()
         assert device.light == "lamp"

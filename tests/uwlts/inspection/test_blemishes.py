@@ -14,7 +14,7 @@ from uwlts.inspection.blemish_search import search_blemishes
 from uwlts.inspection.blemishes import (
     NotSignificantError,
     _Bell,
-    _interpolation_rows,
+    _interpolate,
     _make_quadratic_rows,
     _measure_section,
     measure_blemish,
@@ -116,9 +116,9 @@ def test_interpolation_and_smoothing_are_exact_for_quadratics() -> None:
     rng = np.random.default_rng(2)
     shape, inner = (9, 12), rng.uniform([1.5, 1.5], [6.5, 9.5], (40, 2))
     u, v = (each.ravel() for each in np.indices(shape).astype(float))
-    rows = _interpolation_rows(inner, shape)
+    rows = _interpolate(inner, shape)
     np.testing.assert_allclose(rows @ quadratic(u, v), quadratic(*inner.T))
-    assert not (_interpolation_rows(np.array([[-5.0, 3.0], [4.0, 40.0]]), shape) @ quadratic(u, v)).any()
+    assert not (_interpolate(np.array([[-5.0, 3.0], [4.0, 40.0]]), shape) @ quadratic(u, v)).any()
     places = rng.uniform(-1, 10, (1500, 2))
     smooth = _make_quadratic_rows(inner, places, KDTree(places), 1.2)
     np.testing.assert_allclose(smooth @ quadratic(*places.T), quadratic(*inner.T))

@@ -478,7 +478,6 @@ def test_wrong_input_is_refused():
     cloud = flat_scan(rng, lambda x, y: 0 * x, everywhere, along=(-5, 5, 1.0), across=(-20, 20, 100))
     for words, options in (
         ("a weld does not take `wall_mm`", {"kind": "weld", "wall_mm": 9.0}),
-        ("a pipe does not take `section_mm`", {"section_mm": 1.0}),
         ("wall_mm is -1", {"wall_mm": -1.0}),
         ("false_alarm is 2", {"false_alarm": 2.0}),
         ("no bead found", {"kind": "weld"}),

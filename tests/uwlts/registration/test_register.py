@@ -18,7 +18,7 @@ from uwlts.evaluation.artefact_figures import evaluate_pipe
 from uwlts.fitting.patches import distances_between, find_disc_radius, surface_patches
 from uwlts.model.artefacts import PipeStandard
 from uwlts.registration.joint_registration import FEWEST_OF_PAIR, JointRegistration, PairEvidence
-from uwlts.registration.register import _open_movements, _overlap, _pair_fit
+from uwlts.registration.register import _measure_overlap, _open_movements, _summarise_pair
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
 from uwlts.storage.pose_files import read_poses, write_poses
 
@@ -90,12 +90,12 @@ def test_the_agreement_of_a_pair_is_that_of_its_residuals():
     residuals, places = np.append(distances, centres), np.arange(12.0).reshape(4, 3)
     pair = PairEvidence(np.ones((10, 1)), residuals, weights, np.ones(10), 1.5, np.zeros((1, 1)), (), places, 4)
     assert pair.normal() == [[10.0]] and pair.gradient() == pytest.approx([0.1 - 0.4 + 0.4 + 2.0])
-    fit = _pair_fit(None, (0, 1), {(0, 1): pair}, None)
+    fit = _summarise_pair(None, (0, 1), {(0, 1): pair}, None)
     assert (fit.patches, fit.spheres, fit.scatter, fit.closure_mm) == (3, 2, 1.5, None)
     assert fit.mean_mm == pytest.approx(0.1) and fit.rms_mm == pytest.approx(np.sqrt(0.21 / 3))
     assert fit.sphere_rms == pytest.approx(np.sqrt(6.5 / 6))
-    np.testing.assert_array_equal(_overlap(pair).places_mm, places[[0, 1, 3]])
-    np.testing.assert_array_equal(_overlap(pair).distance_mm, [0.1, -0.2, 0.4])
+    np.testing.assert_array_equal(_measure_overlap(pair).places_mm, places[[0, 1, 3]])
+    np.testing.assert_array_equal(_measure_overlap(pair).distance_mm, [0.1, -0.2, 0.4])
 
 
 def test_undetermined_motions_are_translations_and_rotations_about_axes():

@@ -192,5 +192,5 @@ def test_fixed_numbers_are_near_and_have_no_negative_zero(value, decimals, signe
 
 
 def test_numbers_have_the_decimals_of_their_scale():
-    assert format_to_scale(0.123456, 1.58) == "0.12" and format_to_scale(7.0, 0.0) == "7.000"
+    assert format_to_scale(0.123456, 0.158) == "0.12" and format_to_scale(7.0, 0.0) == "7.000"
     assert format_fixed(math.nan) == "-"

@@ -138,7 +138,7 @@ def rounded_box(size_mm: np.ndarray, *, radius_mm: float) -> tuple[np.ndarray, n
     caps = [(bottom[0], bottom[3], bottom[2]), (bottom[0], bottom[2], bottom[1]), top[[0, 1, 2]], top[[0, 2, 3]]]
     faces = np.concatenate([faces, np.array(caps)])
     # Triangles at the poles have no area.
-    return vertices, faces[np.linalg.norm(_normals(vertices, faces), axis=1) > 0]
+    return vertices, faces[np.linalg.norm(_compute_normals(vertices, faces), axis=1) > 0]
 
 
 def add_relief(
@@ -153,7 +153,7 @@ def add_relief(
     """
     vertices, faces, *uv = surface
     lengths = np.ones(3) * own.relief_length_mm
-    area = 0.5 * float(np.linalg.norm(_normals(vertices, faces), axis=1).sum())
+    area = 0.5 * float(np.linalg.norm(_compute_normals(vertices, faces), axis=1).sum())
     step = max(float(lengths.min()) / 20, 2 * float(np.sqrt(area / _RELIEF_VERTICES)))
     values, faces = _split_edges(np.hstack([vertices, *uv]), faces, step)
     fine, cell = np.ascontiguousarray(values[:, :3]), step / float(lengths.min())
@@ -168,13 +168,13 @@ def add_relief(
         variance += field.var()
     height *= own.relief_mm / np.sqrt(variance)
     # The normal of a vertex is the mean of its facets', weighted by their areas.
-    corners = np.repeat(_normals(fine, faces), 3, axis=0).T
+    corners = np.repeat(_compute_normals(fine, faces), 3, axis=0).T
     outward = np.stack([np.bincount(faces.ravel(), each, len(fine)) for each in corners], axis=1)
     outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), np.finfo(float).tiny)
     return fine + outward * height[:, None], faces, *([values[:, 3:]] if uv else [])
 
 
-def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def _compute_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return the normals (F, 3) of triangles, twice as long as their areas in mm2."""
     a, b, c = (vertices[corner] for corner in faces.T)
     return np.cross(b - a, c - a)

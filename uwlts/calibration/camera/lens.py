@@ -199,8 +199,8 @@ def calibrate_lens(
         They are within five robust standard deviations, which are at least `_FINEST_PX`. Images with too many other
         points are left out.
         """
-        robust = solve(images, start=plain, options=replace(options, soft_limit_px=_SOFT * _scatter(plain)))
-        limit = DEFAULT_K * max(_scatter(robust), _FINEST_PX)
+        robust = solve(images, start=plain, options=replace(options, soft_limit_px=_SOFT * _measure_scatter(plain)))
+        limit = DEFAULT_K * max(_measure_scatter(robust), _FINEST_PX)
         misses = [np.linalg.norm(residuals, axis=1) for residuals in robust.residuals_px]
         shares.update(enumerate(float(np.mean(each <= limit)) for each in misses))
         return {n: each <= limit for n, each in enumerate(misses) if shares[n] >= 1 - _LARGEST_REJECTED}
@@ -239,7 +239,7 @@ def calibrate_lens(
         and choice.tangential > 0
         and "p1" not in full.distortion
     ):
-        scatter = _scatter(solve([*cleaned.values()], options=options))
+        scatter = _measure_scatter(solve([*cleaned.values()], options=options))
         names = (*options.distortion, "p1", "p2")
         full = replace(options, distortion=names, tangential=(choice.tangential, max(scatter, _LEAST_SCATTER_PX)))
     intrinsics = Intrinsics(full, width_px=width_px, height_px=height_px)
@@ -303,7 +303,7 @@ def _find_widest_deg(images: Sequence[TargetImage], solution: CameraSolution) ->
     return float(np.degrees(np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2]).max()))
 
 
-def _scatter(solution: CameraSolution) -> float:
+def _measure_scatter(solution: CameraSolution) -> float:
     """Return the robust standard deviation of one coordinate of the residuals."""
     # median distance in two coordinates, divided by the standard deviation of one
     return float(np.median(np.linalg.norm(np.vstack(solution.residuals_px), axis=1))) / 1.1774

@@ -6,7 +6,7 @@ from functools import cached_property
 from typing import assert_never
 
 import numpy as np
-from scipy.stats import chi2
+from scipy import special
 
 from uwlts.calibration.joint.estimate import UNSETTLED, Estimate, Evidence, outliers
 from uwlts.calibration.joint.gathering import USUAL_DISTORTION
@@ -258,7 +258,7 @@ class PriorDeviations:
         """
         gained = [d for d in self.every if d.gain > _MUCH_GAINED and not isinstance(d.key, TargetParameter)]
         squares = np.array([each.sigmas**2 for each in gained])
-        if len(squares) < _FEWEST_GAINED or squares.sum() < chi2.isf(_FALSE_ALARM, len(squares)):
+        if len(squares) < _FEWEST_GAINED or squares.sum() < special.chdtri(len(squares), _FALSE_ALARM):
             return 1.0
         return float(np.sqrt(squares.mean()))
 

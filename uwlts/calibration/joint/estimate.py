@@ -259,7 +259,8 @@ def estimate_noise(kind: str, residuals: Sequence[Residuals], points: Sequence[n
     if kind == TARGET:
         places = np.vstack(points)[:, :2]
         together = max(
-            _find_point_variance_factor(values, places, kept, sigma), _image_variance_factor(residuals, places, sigma)
+            _find_point_variance_factor(values, places, kept, sigma),
+            _find_image_variance_factor(residuals, places, sigma),
         )
     else:
         together = _find_neighbour_variance_factor(residuals, sigma)
@@ -285,7 +286,7 @@ def _find_point_variance_factor(values: np.ndarray, places: np.ndarray, kept: np
     return float(np.mean(sums[:, often] ** 2 / number[often])) / sigma**2
 
 
-def _image_variance_factor(residuals: Sequence[Residuals], places: np.ndarray, sigma: float) -> float:
+def _find_image_variance_factor(residuals: Sequence[Residuals], places: np.ndarray, sigma: float) -> float:
     """Return the variance factor of residuals that vary smoothly across an image, as with a wrong lens or bent target.
 
     Independent residuals have the variance sigma^2 along each orthonormal function of the position; here all products

@@ -168,7 +168,7 @@ def estimate_series_start(
                 "positions, and that all captures are from the same camera and medium"
             )
         lens = intrinsics.from_model(seen.model)
-        index = _index_behind_window(base.view, indices)
+        index = _find_index_behind_window(base.view, indices)
         for place, name in enumerate(intrinsics.names):
             lens[place] /= index if name in ("f", "fx", "fy") else index**2 if name in DISTORTION else 1.0
     start = SeriesStart(sensor, window, indices, intrinsics, lens, [], [])
@@ -241,7 +241,7 @@ def _refuse_turned_images(series: Series, poses: Sequence[np.ndarray], sensor: S
             refuse_turned_travel(travel, camera_from_object(sensor)[:3, :3] @ direction)
 
 
-def _index_behind_window(view: ViewMedium, indices: Sequence[float]) -> float:
+def _find_index_behind_window(view: ViewMedium, indices: Sequence[float]) -> float:
     """Return the index behind the window; without a window the lens model includes the medium."""
     return indices[view.medium] if view.window and view.medium is not None else 1.0
 
@@ -253,7 +253,7 @@ class _Viewpoint:
         self._camera, self._window, self._index = (
             camera,
             window if view.window else None,
-            _index_behind_window(view, indices),
+            _find_index_behind_window(view, indices),
         )
 
     def pose(self, placement: Placement) -> np.ndarray:

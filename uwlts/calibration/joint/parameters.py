@@ -139,17 +139,17 @@ class DescribedSheet:
 
     def model(self, values: np.ndarray) -> SheetModel:
         """Return the sheet for parameters (5,)."""
-        normal, _ = self._normal(values)
+        normal, _ = self._compute_normal(values)
         offset = float(normal @ self.middle_mm + values[2])
         return SheetModel(normal=tuple(normal.tolist()), offset_mm=offset, fan=self.fan(values))
 
-    def _normal(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _compute_normal(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the normal (3,) and its derivatives (2, 3) by the two rotations."""
         return tilt_direction(self.normal, np.stack([self.axis, np.cross(self.axis, self.normal)]), values[:2])
 
     def miss_by(self, values: np.ndarray, points: np.ndarray, index: float) -> np.ndarray:
         """Return derivatives (6, N) of `SheetSurface.miss_mm` at points (3, N) by the parameters and the index."""
-        normal, normal_by = self._normal(values)
+        normal, normal_by = self._compute_normal(values)
         turn, bow = values[4], values[3]
         angle = turn * (1.0 - 1.0 / index)
         cosine, sine = np.cos(angle), np.sin(angle)

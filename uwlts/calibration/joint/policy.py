@@ -304,9 +304,7 @@ class _Attempt:
         if choice.pixels == "auto" and not free_pixels:
             if best.against.misfits:
                 free = best._use_lens(replace(best.options.camera, pixel_aspect=None))
-                best = (
-                    free if free is not None and _scatter(free.result) < _CLEARLY_LESS * _scatter(best.result) else best
-                )
+                best = free if free is not None and _score(free.result) < _CLEARLY_LESS * _score(best.result) else best
             best = best._describe_lens(camera)
             return best._free_spacings_and_pixels() or best
         return best._describe_lens(camera)
@@ -321,7 +319,7 @@ class _Attempt:
                 tried[options] = trial.linearise(result).predict(), result
         if not tried:
             return self.options.camera
-        noise = min((result for _, result in tried.values()), key=_scatter).noise
+        noise = min((result for _, result in tried.values()), key=_score).noise
         squares = {options: mean_squares(held, noise) for options, (held, _) in tried.items()}
         return select_model(compare_models(squares, least_gain=_LEAST_GAIN), self.options.camera)
 
@@ -419,6 +417,6 @@ _RULES: tuple[tuple[Callable[[_Attempt], _Attempt | None], int], ...] = (
 )
 
 
-def _scatter(result: Estimate) -> float:
+def _score(result: Estimate) -> float:
     """Return the geometric mean of the scatter of target points and stripes, px."""
     return float(np.exp(np.mean(np.log([noise.sigma_px for noise in result.noise.values()]))))

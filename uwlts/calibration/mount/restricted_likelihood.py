@@ -7,8 +7,8 @@ from functools import cached_property
 from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
+from scipy import special
 from scipy.optimize import least_squares, minimize
-from scipy.stats import f, t
 
 from uwlts.errors import CalibrationError
 
@@ -153,7 +153,7 @@ class RestrictedEstimate(Generic[State]):
             by = basis.T @ self.jacobian[g]
             spread = by @ covariance @ by.T + basis.T @ self.covariances[0][g] @ basis
             off = basis.T @ self.residuals[g] + by @ step
-            limit = len(off) * f.isf(probability, len(off), freedom)
+            limit = len(off) * special.fdtri(len(off), freedom, 1 - probability)
             excess.append(float(off @ np.linalg.solve(spread, off) / limit))
         return np.array(excess)
 
@@ -176,7 +176,7 @@ class RestrictedEstimate(Generic[State]):
         by = np.einsum("rp,qpm,mn,rn->rq", rows, summed, self.covariance, rows)[:, free]
         uncertain = np.einsum("rq,qs,rs->r", by, invert_information(known[free][:, free]), by)
         freedom = 2 * variances**2 / np.maximum(uncertain * scales**2, 1e-30 * variances**2)
-        return float(t.ppf(0.975, max(float(np.median(freedom)), 1.0)))
+        return float(special.stdtrit(max(float(np.median(freedom)), 1.0), 0.975))
 
 
 def settle(evidence: GroupedEvidence[State], starts: Sequence[tuple[State, np.ndarray]]) -> RestrictedEstimate[State]:

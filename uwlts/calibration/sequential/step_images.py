@@ -15,7 +15,7 @@ from uwlts.calibration.capture_evidence import StepEvidence
 from uwlts.errors import CalibrationError, EvaluationError
 from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.sensor import Uncertainty
-from uwlts.optics.triangulation import points_on_sheet
+from uwlts.optics.triangulation import reconstruct_pixels
 from uwlts.shapes.flat import Line, Plane
 from uwlts.shapes.step import StepFace, label_step_faces, step_height
 
@@ -55,9 +55,8 @@ def step_profile(
     calibration: Calibration, window: WindowModel | None, pixels: np.ndarray, *, medium_index: float
 ) -> np.ndarray:
     """Return points (N, 2) of a profile, Y and Z of the OCS in mm, through a window; else NaN."""
-    seen = points_on_sheet(calibration.model_copy(update={"window": window}), pixels, medium_index=medium_index)
-    object_from_camera = np.linalg.inv(calibration.object_transform())
-    return seen.points_mm @ object_from_camera[1:3, :3].T + object_from_camera[1:3, 3]
+    placed = calibration.model_copy(update={"window": window})
+    return reconstruct_pixels(placed, pixels, medium_index=medium_index).points_mm[:, 1:]
 
 
 def label_step(calibration: Calibration, window: WindowModel | None, step: StepEvidence) -> StepImage:
@@ -249,7 +248,7 @@ def solve_window(
         raise CalibrationError(f"the heights of the steps must be positive lengths in mm, not {true.tolist()}")
 
     def heights(distance: float) -> np.ndarray:
-        return _heights(calibration, window, steps, distance)[:, 0]
+        return _measure(calibration, window, steps, distance)[:, 0]
 
     tried = np.linspace(low, high, _CURVE_POINTS)
     scanned = np.array([heights(distance) for distance in tried])
@@ -273,7 +272,7 @@ def solve_window(
         x_scale=high - low,
     )
     distance, slopes = float(best.x[0]), best.jac[:, 0]
-    measured, height_std = _heights(calibration, window, steps, distance).T
+    measured, height_std = _measure(calibration, window, steps, distance).T
     errors = measured - true
     change, scatter = (np.sqrt(np.mean(v**2)) for v in (np.ptp(scanned[usable], axis=0), height_std))
     if change < max(_LEAST_CHANGE * scatter, _ROUNDING_MM):
@@ -293,7 +292,7 @@ def solve_window(
     std = float(np.sqrt(errors @ errors / freedom / squares)) if freedom else None
     scatter_std = float(np.linalg.norm(slopes * height_std)) / squares
     denser = [replace(step, medium_index=step.medium_index + _INDEX_STEP) for step in steps]
-    by_index = (_heights(calibration, window, denser, distance)[:, 0] - measured) / _INDEX_STEP
+    by_index = (_measure(calibration, window, denser, distance)[:, 0] - measured) / _INDEX_STEP
     per_height, per_index = float(slopes.sum()) / squares, -float(slopes @ by_index) / squares
     height_std_mm = max(step.height_std_mm(known) for step in steps)
     index_std = max(step.index_std for step in steps)
@@ -318,7 +317,7 @@ def solve_window(
     )
 
 
-def _heights(calibration: Calibration, window: WindowModel, steps: Sequence[StepImage], distance: float) -> np.ndarray:
+def _measure(calibration: Calibration, window: WindowModel, steps: Sequence[StepImage], distance: float) -> np.ndarray:
     """Return the height of the step in every image and its standard deviation, mm: (S, 2).
 
     NaN if a point of a tread cannot be reconstructed.
@@ -352,7 +351,7 @@ def _solve_single_distance(
     left = changes[np.argmin(np.abs(tried[changes] - near))]
 
     def error(distance: float) -> float:
-        return float(_heights(calibration, window, [step], distance)[0, 0]) - step.height_mm()
+        return float(_measure(calibration, window, [step], distance)[0, 0]) - step.height_mm()
 
     return float(root_scalar(error, bracket=(tried[left], tried[left + 1]), method="brentq", xtol=1e-7).root)
 

@@ -92,7 +92,7 @@ def _parse_row(number: int, cells: dict[str, str], place: str) -> ImageRow:
     light = texts["light"].lower() or None
     if light is not None and light not in _LIGHTS:
         raise DescriptionError(f"{place}: the light is {light!r}; expected {', '.join(_LIGHTS)}")
-    numbers: dict[str, Any] = {name: _number(texts[name], f"{place}: {name}") for name in (*_NUMBERS, *POSE_COLUMNS)}
+    numbers: dict[str, Any] = {name: _parse(texts[name], f"{place}: {name}") for name in (*_NUMBERS, *POSE_COLUMNS)}
     pose = np.array([numbers.pop(name) for name in POSE_COLUMNS]).reshape(4, 4)
     given = np.count_nonzero(np.isfinite(pose))
     if given not in (0, 16):
@@ -104,7 +104,7 @@ def _parse_row(number: int, cells: dict[str, str], place: str) -> ImageRow:
     return ImageRow(texts["file"], number, light, texts["background"] or None, pose=pose if given else None, **numbers)
 
 
-def _number(text: str, place: str) -> float:
+def _parse(text: str, place: str) -> float:
     """Return the finite number of a cell, NaN if it is empty."""
     try:
         value = float(text) if text else 0.0
