@@ -14,7 +14,7 @@ from uwlts.evaluation.artefact_figures import (
     measure_step,
 )
 from uwlts.evaluation.figures import ArtefactEvaluation, FigureUncertainty, Quantity
-from uwlts.fitting.propagation import LinearisedFit, PointErrors, noise_shifts
+from uwlts.fitting.propagation import LinearisedFit, PointErrors
 from uwlts.model.artefacts import StepStandard
 from uwlts.shapes.cylinder import Cylinder
 from uwlts.shapes.flat import Plane
@@ -86,20 +86,14 @@ def linearise_figures(cloud: PointCloud, evaluation: ArtefactEvaluation) -> Line
 def shift_std_mm(cloud: PointCloud, used: np.ndarray) -> np.ndarray:
     """Return the standard uncertainty (3,) of the mean of the ``used`` (N,) points, mm; NaN without uncertainty.
 
-    Patterns are common to all points, position errors to the points of an image, and noise is independent (GUM,
-    Eq. 13).
+    Patterns are common to all points, position errors to those of an image; noise is independent (GUM, Eq. 13).
     """
     if (uncertainty := cloud.uncertainty) is None:
         return np.full(3, np.nan)
-    count = np.count_nonzero(used)
-    together = uncertainty.patterns_mm[:, used].sum(axis=1)
-    image = np.unique(cloud.frame[used], return_inverse=True)[1]
-    by_image = [
-        np.stack([np.bincount(image, moves) for moves in part[used].T], axis=1)
-        for part in uncertainty.image_errors_mm()
-    ]
-    moved = np.vstack([together, *by_image, noise_shifts(uncertainty)[used]])
-    return np.sqrt(np.sum(moved**2, axis=0)) / count
+    errors = PointErrors.from_uncertainty(uncertainty, cloud.frame)
+    axes = np.eye(3)[:, None] * (used / np.count_nonzero(used))[:, None]
+    common = np.einsum("mni,ani->ma", uncertainty.patterns_mm, axes)
+    return np.hypot([errors.linear_std(axis) for axis in axes], np.linalg.norm(common, axis=0))
 
 
 def _linearise_plane(points: np.ndarray, evaluation: PlaneEvaluation) -> LinearisedFigures:

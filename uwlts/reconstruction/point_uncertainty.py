@@ -48,10 +48,7 @@ _TABLE_TOLERANCE_MM = 1e-6
 _LEFT_OUT_MM = 1e-9
 """Largest sum of omitted last terms of tables."""
 _PULL = [2.0, 3.0], [0.12, 0.0]
-"""Full widths at half maximum, px, and error of the profile fit with the place in the pixel, relative to the noise.
-
-Largest of simulated stripes in speckle: 0.12 for sigmas of 0.45 to 0.8 px, 0.04 for 1 px, 0.015 from 1.15 px on. Its
-sign changes with the width: the fitted pixels are a whole number, and the noise decides at their ends."""
+"""Full widths at half maximum, px, and largest errors of simulated stripes in speckle relative to the noise."""
 _LARGEST_NOISE_PX = 0.2  # noise above which a centre does not tell its place in the pixel
 _Arrays = tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -124,11 +121,9 @@ def _find_median(values: np.ndarray) -> float:
     return 0.5 * (low + high)
 
 
-def estimate_pull_px(centre_px: np.ndarray, width_px: np.ndarray, noise_px: np.ndarray) -> np.ndarray:
-    """Estimate the possible errors (N,) of centres with their place in the pixel; the sign of all is unknown.
-
-    Normal noise of standard deviation s lowers the mean sine of measured centres by exp(-2 pi^2 s^2).
-    """
+def estimate_pull_px(centre_px: np.ndarray, width_px: np.ndarray | float, noise_px: np.ndarray) -> np.ndarray:
+    """Estimate the errors (N,) of narrow stripes' centres with their place in the pixel; their common sign is unknown."""
+    # Normal noise of standard deviation s lowers the mean sine of measured centres by exp(-2 pi^2 s^2).
     lowered = np.exp(-2 * np.pi**2 * np.minimum(noise_px, _LARGEST_NOISE_PX) ** 2)
     return np.interp(width_px, *_PULL) * noise_px * np.sin(2 * np.pi * centre_px) / lowered
 
@@ -138,9 +133,9 @@ def point_uncertainty(
     calibration: Calibration,
     centres: _Arrays,
     *,
-    width_px: np.ndarray | None = None,
-    blur_px: np.ndarray | None = None,
-    beside_mm: np.ndarray | None = None,
+    width_px: np.ndarray | float = np.inf,
+    blur_px: np.ndarray | float = 0.0,
+    beside_mm: np.ndarray | float = 0.0,
     mount_by: np.ndarray | None = None,
     digest: str | None = None,
     chosen: ErrorPatterns | None = None,
@@ -151,11 +146,9 @@ def point_uncertainty(
     the stage's position, scale and direction about its central position, and drift of the water since the calibration,
     unless the calibration uses this capture. It excludes errors of poses (`uwlts.reconstruction.moving`).
 
-    ``centres`` are image, profile line and position in px of each stripe centre, three arrays (N,). ``width_px`` (N,)
-    are full widths at half maximum: narrow stripes in speckle are shifted with their place in the pixel, those of a
-    level face alike. ``blur_px`` (N,) is the possible shift of the centres by blur, ``beside_mm`` (N, 3) the applied
-    shift of the points to the origin of their light (`uwlts.optics.brightness`). These relative errors are common to
-    all points.
+    ``centres`` are image, profile line and position in px of each stripe centre, ``width_px`` (N,) full widths at half
+    maximum. ``blur_px`` (N,) are possible shifts of the centres by blur, ``beside_mm`` (N, 3) applied shifts of the
+    points to the origin of their light (`uwlts.optics.brightness`). Their relative errors are common to all points.
 
     ``mount_by`` (6, P) are the derivatives of a calibrated mount by the parameters of the joint estimate
     (`uwlts.model.mount.SensorShare`), for frames with poses of a platform. They correlate the errors of points and
@@ -173,9 +166,8 @@ def point_uncertainty(
     known = read_stored_estimate(calibration, sensor, header.medium)
     noise = estimate_stripe_noise_px(frame, line, centre_px)
     of_sensor = sensor_poses(capture)
-    pose = of_sensor[:, :3, :3]
     posed = np.all(np.isfinite(of_sensor), axis=(1, 2), keepdims=True)
-    pose_of = np.where(posed, pose, np.eye(3))
+    pose_of = np.where(posed, of_sensor[:, :3, :3], np.eye(3))
     by_stage_alone = ~posed[:, 0, 0]
     middle = np.mean(capture.stage_mm[by_stage_alone]) if by_stage_alone.any() else 0.0
     stage = np.where(by_stage_alone, capture.stage_mm - middle, 0.0)
@@ -192,13 +184,9 @@ def point_uncertainty(
     of_estimate = tuple(array.tobytes() for array in (known.values, root, rigid))
     key = None if digest is None else ("uncertainty", digest, known.view, *of_estimate)
     table = LineTable.over_range(exact, line, centre_px, tolerance=_TABLE_TOLERANCE_MM, key=key)
-    beside = (
-        np.zeros((len(line), 3)) if beside_mm is None else brightness_shift_std(header.sensor.uncertainty) * beside_mm
-    )
+    beside = np.zeros((len(line), 3)) + brightness_shift_std(header.sensor.uncertainty) * beside_mm
     # Blur shifts the centres on steep surfaces, the place in the pixel those on level ones: they share a pattern.
-    shift = np.zeros(len(line)) if blur_px is None else BLUR_STD * blur_px
-    if width_px is not None:
-        shift += estimate_pull_px(centre_px, width_px, noise)
+    shift = BLUR_STD * blur_px + estimate_pull_px(centre_px, width_px, noise)
 
     def moved(some: slice, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the noise covariance (n, 6) of some points, and weighted sums (M, n, 3) of their error components."""
