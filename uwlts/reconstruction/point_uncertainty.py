@@ -122,7 +122,7 @@ def _find_median(values: np.ndarray) -> float:
 
 
 def estimate_pull_px(centre_px: np.ndarray, width_px: np.ndarray | float, noise_px: np.ndarray) -> np.ndarray:
-    """Estimate the errors (N,) of narrow stripes' centres with their place in the pixel; their common sign is unknown."""
+    """Estimate errors (N,) of narrow stripes' centres with their place in the pixel; their common sign is unknown."""
     # Normal noise of standard deviation s lowers the mean sine of measured centres by exp(-2 pi^2 s^2).
     lowered = np.exp(-2 * np.pi**2 * np.minimum(noise_px, _LARGEST_NOISE_PX) ** 2)
     return np.interp(width_px, *_PULL) * noise_px * np.sin(2 * np.pi * centre_px) / lowered
