@@ -34,7 +34,6 @@ MEANING = {
         "--medium": "One of the sensor's media",
         "--mount": "Pose of the sensor on its platform",
         "--out": "to write|New folder",
-        "--title": "Title of the",
         "--overwrite": "Replace|replace",
         "--pixels": "Whether pixels are square",
         "--page": "Page to write, with all figures",

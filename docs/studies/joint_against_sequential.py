@@ -63,7 +63,7 @@ def measure(seed: int, errors: ModelErrors) -> tuple[str, float]:
         sensor=sensor,
         medium_kind="air",
         stage_direction=np.array([0.0, 0.0, 1.0]),
-        approaching=series.approaching,
+        approaching=series.approaching is not False,
         air=replace(series.found, outliers=[0] * len(series.found.images)),
         window=sensor.camera.window,
         steps=[step for step, _ in gathered.steps],

@@ -146,7 +146,6 @@ def test_an_encoder_places_the_frames_without_any_clock(hill, tmp_path):
     with Capture(tmp_path / "a.h5") as capture:
         # A count is a step of 0.01 mm.
         assert np.abs(capture.stage_mm - true_places(capture, hill)).max() <= 0.5 * ENCODER_MM + 1e-6
-        assert np.isfinite(capture.encoder).all()
         # A busy machine makes fewer frames.
         assert all("frames were lost" in each for each in warned)
 

@@ -37,13 +37,11 @@ twin simulate spheres --placement standoff --seed 1 --as-built thesis-as-built -
 twin simulate pipe --as-built thesis-as-built --out pipe.h5
 twin simulate plane --as-built thesis-as-built --out plane.h5
 twin simulate weld --as-built thesis-as-built --out weld.h5
-twin simulate step-scan --as-built thesis-as-built --out step-scan.h5
 uwlts calibrate --air target-air.h5 --water target-water.h5 --step step-near.h5 step-far.h5 --out calibration.json
 uwlts certificate calibration.json --out certificate.html
 uwlts reconstruct spheres.h5 --calibration calibration.json --out spheres.cloud.h5
 uwlts reconstruct pipe.h5 --calibration calibration.json --out pipe.cloud.h5
 uwlts reconstruct weld.h5 --calibration calibration.json --out weld.cloud.h5
-uwlts reconstruct step-scan.h5 --calibration calibration.json --out step-scan.cloud.h5
 """
 
 MAKE = {"make ": "`make test-full` runs this test, and demo, bench, docs and check take minutes each"}

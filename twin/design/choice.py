@@ -49,35 +49,19 @@ def find_pareto_front(values: np.ndarray) -> np.ndarray:
     """
     front = np.zeros(len(values), dtype=bool)
     candidates = np.flatnonzero(~np.isnan(values).any(axis=1))
-    if len(candidates):
-        front[candidates] = (_find_front_of_two if values.shape[1] <= 2 else _find_front_of_many)(values[candidates])
-    return front
-
-
-def _find_front_of_two(values: np.ndarray) -> np.ndarray:
-    """Return the front of one or two values.
-
-    Sorted by the first value, a design is on the front if its second value is smaller than all before.
-    """
-    first, second = values[:, 0], values[:, -1]
-    order = np.lexsort((second, first))
-    first, second = first[order], second[order]
-    starts = np.concatenate([[True], first[1:] > first[:-1]])
-    least, group = second[starts], np.cumsum(starts) - 1
-    better = np.concatenate([[True], least[1:] < np.minimum.accumulate(least)[:-1]])
-    front = np.empty(len(values), dtype=bool)
-    front[order] = (second == least[group]) & better[group]
-    return front
-
-
-def _find_front_of_many(values: np.ndarray) -> np.ndarray:
-    """Return the front by elimination: the lexicographically first of the remaining designs is always on it."""
-    left = np.lexsort(values.T[::-1])
-    front = np.zeros(len(values), dtype=bool)
-    while len(left):
-        best = values[left[0]]
-        front[left[(values[left] == best).all(axis=1)]] = True
-        left = left[(values[left] < best).any(axis=1)]
+    if not len(candidates):
+        return front
+    # Sorted by the first value, then by the next: the first of the remaining designs is always on the front.
+    different, place = np.unique(values[candidates], axis=0, return_inverse=True)
+    if values.shape[1] <= 2:
+        last = different[:, -1]
+        best = np.append(True, last[1:] < np.minimum.accumulate(last)[:-1])
+    else:
+        best, left = np.zeros(len(different), dtype=bool), np.arange(len(different))
+        while len(left):
+            best[left[0]] = True
+            left = left[(different[left] < different[left[0]]).any(axis=1)]
+    front[candidates] = best[place]
     return front
 
 
@@ -181,7 +165,7 @@ def choose(
         missed = one.figure("violation")[0]
         return bool(missed <= winner.design.violation and one.cost()[0] < known - 1e-6 * abs(known))
 
-    if study.refine and (end := refine_design(study, winner.design.without_results(), better)) is not None:
+    if (end := refine_design(study, winner.design.without_results(), better)) is not None:
         marked.append(
             HighlightedDesign(
                 "refined along the gradient", build_sensor(study, end), select_design(evaluate_designs(study, [end]), 0)

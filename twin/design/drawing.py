@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from twin.design.figures_of_merit import evaluate_field
+from twin.design.figures_of_merit import find_line_ends
 from twin.design.sensor_arrays import extract_parameters
 from twin.design.study_tables import number_text
 from uwlts.model.placement import laser_pose
@@ -23,7 +23,6 @@ from uwlts.pages.toolkit import BLUE, INK, RED, SOFT, new_figure
 
 _BEYOND = 1.06  # length of drawn rays and sheet relative to the distance of the volume's far end
 _DEPTHS = 201  # depths at which the region that both camera and laser reach is searched
-_PLACES = 21  # points along the stripe at each depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,13 +74,10 @@ def make_view(sensor: Sensor, medium: Medium) -> SideView:
         WindowGeometry.from_description(one, medium, sensor.laser.wavelength_nm, turned) if one.mounted else None
         for one, turned in ((camera.window, np.eye(3)), (sensor.laser.window, frame))
     ]
-    depths = np.linspace(sensor.volume.near_mm, sensor.volume.far_mm, _DEPTHS)
-    places = np.linspace(-1, 1, _PLACES) * (1 - 1e-9)
-    with np.errstate(all="ignore"):
-        field = evaluate_field(np, p, depths.reshape(1, -1, 1), places.reshape(1, 1, -1), reflectance=0.5)
+    depths = outer + np.linspace(sensor.volume.near_mm, sensor.volume.far_mm, _DEPTHS)
+    near, far = depths[[0, -1]]
     # Depths at which both camera and laser reach a part of the line.
-    reached = np.broadcast_to(field.in_view, (1, _DEPTHS, _PLACES))[0].any(axis=1)
-    near, far = outer + depths[[0, -1]]
+    reached = np.diff(find_line_ends(p, (depths - crossing) / pose.axis[2]))[:, 0] >= 0
 
     end = pose.origin_mm + _BEYOND * ((on_sheet(np.array([far]))[0] - pose.origin_mm) @ pose.axis) * pose.axis
     (axis,) = _trace(pose.origin_mm, windows[1], pose.axis[None], end, pose.axis)
@@ -99,7 +95,7 @@ def make_view(sensor: Sensor, medium: Medium) -> SideView:
         edges=tuple(_trace(pupil, windows[0], border, far * _BEYOND * ahead, ahead) @ side_axes.T),
         sheet=axis @ side_axes.T,
         volume=on_sheet(np.array([near, far])) @ side_axes.T,
-        in_view=on_sheet(outer + depths[reached][[0, -1]]) @ side_axes.T if reached.any() else None,
+        in_view=on_sheet(depths[reached][[0, -1]]) @ side_axes.T if reached.any() else None,
         crossing=np.array([0.0, crossing]),
         outer_mm=outer,
         angle_rad=math.atan2(abs(pose.normal[2]), sideways),

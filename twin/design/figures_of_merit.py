@@ -38,6 +38,7 @@ from uwlts.optics.design import (
 
 DEPTHS = 5  # number of evaluated depths, evenly spaced over the part of the measuring volume in the camera's view
 PLACES = 7  # number of evaluated points along the stripe at each depth
+_LINE_PLACES = 101  # the same where only the ends of the line in view are wanted
 _MANY = 200  # least number of designs that is worth the time to compile the formulas
 _BLOCK = 1000  # number of designs in a block of the compiled formulas
 _BRIGHT_LINES = 2.05
@@ -340,16 +341,32 @@ FIGURES: dict[str, tuple[str, str]] = {
 """Label and unit of each figure of merit, by name."""
 
 
+def evaluate_sheet(p: SensorArrays, z_mm: np.ndarray, *, places: int, reflectance: float) -> Field:
+    """Return the `Field` (1, K, places) of one design at ``z_mm`` (K,) from the stand-off, along the whole stripe."""
+    with np.errstate(all="ignore"):
+        pose = p.pose(np)
+        depth = standoff_mm(pose) - p.outer_mm(np) + pose.axis[2] * z_mm.reshape(1, -1, 1)
+        along = np.linspace(-1, 1, places).reshape(1, 1, -1) * (1 - 1e-9)
+        return evaluate_field(np, p, depth, along, reflectance=reflectance)
+
+
+def find_line_ends(p: SensorArrays, z_mm: np.ndarray) -> np.ndarray:
+    """Return the ends (K, 2) along Y of the line that laser and camera of one design reach at ``z_mm`` (K,).
+
+    They are infinite, the first one above the second one, where there is no such line. ``z_mm`` counts from the
+    stand-off.
+    """
+    f = evaluate_sheet(p, z_mm, places=_LINE_PLACES, reflectance=0.5)
+    ends = np.where(f.in_view, f.y_mm, np.inf).min(axis=2), np.where(f.in_view, f.y_mm, -np.inf).max(axis=2)
+    return np.concatenate(ends).T
+
+
 def predict_scatter(p: SensorArrays, z_mm: np.ndarray, half_line_mm: np.ndarray, *, reflectance: float) -> np.ndarray:
     """Return the root mean square of sigma Z (K,) along the stripe of one design at ``z_mm`` (K,) from the stand-off.
 
     The stripe is evaluated up to ``half_line_mm`` (K,) on both sides, within the view.
     """
-    with np.errstate(all="ignore"):
-        pose = p.pose(np)
-        depth = standoff_mm(pose) - p.outer_mm(np) + pose.axis[2] * z_mm.reshape(1, -1, 1)
-        places = np.linspace(-1, 1, 2 * PLACES + 1).reshape(1, 1, -1) * (1 - 1e-9)
-        f = evaluate_field(np, p, depth, places, reflectance=reflectance)
+    f = evaluate_sheet(p, z_mm, places=2 * PLACES + 1, reflectance=reflectance)
     counts = f.in_view & (np.abs(f.y_mm) <= half_line_mm.reshape(1, -1, 1) + 1e-9)
     squares = np.where(counts, f.sigma_z_mm**2, 0.0)
     return np.sqrt(squares.sum(axis=2) / np.maximum(counts.sum(axis=2), 1))[0]

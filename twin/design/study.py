@@ -118,9 +118,8 @@ class Study(Description):
     ``sensor`` is the base sensor, given by name, path or table. It is stored completely, because remote workers may not
     have its file. ``variables`` are free values of the sensor's description by path (``camera.focal_length_mm``).
     ``choices`` are named alternatives that set several paths at once, such as commercial cameras. ``follow`` lists the
-    adjustments to each design's stand-off, see `twin.design.sensor_arrays.compute_adjustments`. ``refine`` enables the
-    refinement of the best design along the gradient. ``verify`` is the number of designs to render, in addition to the
-    base sensor.
+    adjustments to each design's stand-off, see `twin.design.sensor_arrays.compute_adjustments`. ``verify`` is the
+    number of designs to render, in addition to the base sensor.
     """
 
     title: str
@@ -134,9 +133,7 @@ class Study(Description):
     sampling: Sampling = Sampling()
     objectives: Annotated[tuple[Objective, ...], Field(min_length=1)] = (Objective(figure="sigma_z_rms_mm"),)
     constraints: dict[str, Constraint] = {}
-    refine: bool = True
     verify: Annotated[int, Field(ge=0, le=1000)] = 2
-    verify_tolerance: Annotated[float, Field(gt=1)] = 1.5
 
     @field_validator("sensor", mode="before")
     @classmethod

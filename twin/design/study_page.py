@@ -16,7 +16,6 @@ from plotly.subplots import make_subplots
 from twin.design import drawing, study_tables as tables
 from twin.design.choice import StudyResults, find_pareto_front
 from twin.design.designs import Columns, HighlightedDesign
-from twin.design.figures_of_merit import RENDERED_SCATTERING_DEPTH
 from twin.design.study import Study
 from twin.design.verification import Agreement
 from uwlts.pages.toolkit import (
@@ -222,18 +221,8 @@ def pareto_chart(judged: StudyResults, marked: Sequence[HighlightedDesign]) -> I
     none = (
         "" if judged.feasible.any() else " No design meets all constraints: the front is that of all working designs."
     )
-    turbid = int((judged.figure("scattering_depth")[known] > RENDERED_SCATTERING_DEPTH).sum())
-    deep = (
-        f" {turbid:,} of the designs are beyond the optical depth of scattering, {RENDERED_SCATTERING_DEPTH:g}, up to "
-        "which formulas and rendering were compared."
-        if turbid
-        else ""
-    )
     more = " Further objectives are not shown." if len(judged.study.objectives) > 2 else ""
-    return (
-        figure,
-        f"Better is {better}. No design is better in both than a design on the line.{more}{none}{thin}{deep}",
-    )
+    return figure, f"Better is {better}. No design is better in both than a design on the line.{more}{none}{thin}"
 
 
 def _describe(judged: StudyResults, names: Sequence[str], place: int) -> str:
@@ -295,7 +284,7 @@ def page_text(
         number=tables.number_text,
         value=tables.value_text,
         verdicts=[
-            (found, tables.agreement_text(study, found), drawn and (figure_svg(drawn[0]), drawn[1]))
+            (found, tables.agreement_text(found), drawn and (figure_svg(drawn[0]), drawn[1]))
             for found in agreements
             for drawn in [verification_chart(found)]
         ],

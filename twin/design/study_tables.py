@@ -13,7 +13,7 @@ from twin.design.choice import StudyResults, describe_turbidity
 from twin.design.designs import HighlightedDesign
 from twin.design.figures_of_merit import CLASS_NAMES, FIGURES, RENDERED_SCATTERING_DEPTH
 from twin.design.study import Study, Variable
-from twin.design.verification import Agreement
+from twin.design.verification import AGREES_WITHIN, Agreement
 from twin.scene.description import Value
 from uwlts.optics.design import SAFETY_FACTOR
 from uwlts.pages.toolkit import Tile
@@ -77,13 +77,10 @@ def number_text(value: float | None, digits: int = 4) -> str:
     """Format a number with significant digits and a minus sign; a dash if it is missing or not finite."""
     if value is None or not math.isfinite(value):
         return MISSING
-    if float(value).is_integer() and abs(value) < 1e6:
+    if float(value).is_integer():
         text = f"{value:.0f}"
     else:
-        text = f"{value:.{digits}g}"
-        # Scientific notation is only for values outside the range of any sensor.
-        if "e" in text and 1e-6 < abs(value) < 1e9:
-            text = f"{value:.0f}" if abs(value) >= 1 else f"{value:.{digits + 5}f}".rstrip("0")
+        text = np.format_float_positional(value, precision=digits, unique=False, fractional=False, trim="-")
     return text.replace("-", "\N{MINUS SIGN}")
 
 
@@ -206,16 +203,13 @@ def _is_at_end(variable: Variable, value: Value | None) -> bool:
     return isinstance(value, int | float) and min(value - least, most - value) <= 1e-3 * (most - least)
 
 
-def agreement_text(study: Study, found: Agreement) -> str:
+def agreement_text(found: Agreement) -> str:
     """Return a sentence on the agreement of formulas and rendering for a design."""
     if found.failure:
         return f"It could not be verified: {found.failure}."
     factor = number_text(found.ratio, 3)
     if found.agrees:
-        return (
-            f"Formulas and rendering agree: their scatters differ by a factor {factor} (limit "
-            f"{number_text(study.verify_tolerance, 3)})."
-        )
+        return f"Formulas and rendering agree: their scatters differ by a factor {factor} (limit {AGREES_WITHIN:g})."
     predicted, rendered = np.array(found.predicted_mm, float), np.array(found.rendered_mm, float)
     with np.errstate(all="ignore"):
         off = np.abs(np.log(rendered / predicted))
@@ -223,7 +217,7 @@ def agreement_text(study: Study, found: Agreement) -> str:
         return "Formulas and rendering could not be compared: rendering found no scatter at any depth."
     worst = int(np.argmax(np.where(np.isfinite(off), off, -1.0)))
     return (
-        f"Formulas and rendering disagree by a factor {factor} (limit {number_text(study.verify_tolerance, 3)}), most "
+        f"Formulas and rendering disagree by a factor {factor} (limit {AGREES_WITHIN:g}), most "
         f"at Z = {number_text(found.z_mm[worst])} mm: {number_text(1e3 * predicted[worst])} µm predicted, "
         f"{number_text(1e3 * rendered[worst])} µm rendered. Do not rely on the formulas for designs like this one."
     )

@@ -123,7 +123,7 @@ def write_csv(path: Path, columns: Columns) -> None:
 
 
 PARTS = "screen"
-_FREE_TO_CHANGE = ("verify", "verify_tolerance", "refine", "title")
+_FREE_TO_CHANGE = ("verify", "title")
 """Settings that can differ when a sweep is continued, as can the number of random, Sobol or optimised designs."""
 
 

@@ -45,6 +45,9 @@ _LARGEST_RESIDUAL = 5.0
 """Limit of residuals from the profile's trend in robust standard deviations; larger ones are outliers."""
 
 
+AGREES_WITHIN = 1.5  # largest factor between rendered and predicted scatter, see docs/results/designs.md
+
+
 @dataclass(frozen=True, eq=False)
 class VerifiedMeasurements:
     """Measurements of a plane normal to the laser's axis at K depths by a rendered sensor.
@@ -226,14 +229,12 @@ def compare_scatter(study: Study, candidate: HighlightedDesign, rendered: Verifi
     return Agreement(
         candidate.label,
         candidate.design.number,
-        z_mm=rendered.z_mm.tolist(),
         predicted_mm=predicted.tolist(),
         rendered_mm=rendered.scatter_mm.tolist(),
-        error_mm=rendered.error_mm.tolist(),
-        line_mm=rendered.line_mm.tolist(),
+        **{name: getattr(rendered, name).tolist() for name in ("z_mm", "error_mm", "line_mm")},
         ratio=factor,
         rendered_over_predicted=ratio,
-        agrees=bool(factor <= study.verify_tolerance),
+        agrees=bool(factor <= AGREES_WITHIN),
         exposure_ms=rendered.exposure_ms,
         predicted_exposure_ms=figures.exposure_ms.item(),
         seconds=rendered.seconds,
@@ -278,8 +279,6 @@ def verify_candidates(
         progress(len(known), len(candidates))
     # Label, number and tolerance can differ from those of the earlier run.
     return [
-        replace(
-            known[place], label=one.label, design=one.design.number, agrees=known[place].ratio <= study.verify_tolerance
-        )
+        replace(known[place], label=one.label, design=one.design.number, agrees=known[place].ratio <= AGREES_WITHIN)
         for place, one in enumerate(candidates)
     ]

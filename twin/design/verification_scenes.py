@@ -10,40 +10,28 @@ from typing import NamedTuple
 
 import numpy as np
 
+from twin.design.figures_of_merit import find_line_ends
+from twin.design.sensor_arrays import extract_parameters
 from twin.scene.description import Scene
 from uwlts.errors import DesignError
 from uwlts.model.library import validate_description
-from uwlts.model.placement import camera_from_object, check_design, laser_pose
+from uwlts.model.placement import camera_from_object, check_design
 from uwlts.model.sensor import Camera, Exposure, Medium, Sensor, Volume
-from uwlts.optics.design import Array, Lens, WindowGeometry, dot, project_points
+from uwlts.optics.design import Array, SheetGeometry, dot
 
 
 @dataclass(frozen=True, eq=False)
 class LineOfSight:
-    """Camera and laser fan of a sensor in a medium.
-
-    ``pose`` is ``T_camera_object`` (4, 4). ``laser_mm`` (3,) is the fan's origin in the OCS. ``fan_slope`` is the
-    tangent of half the fan's angle in the medium.
-    """
+    """Camera of a sensor in a medium, with the pose ``T_camera_object`` (4, 4)."""
 
     camera: Camera
-    index: float
-    window: WindowGeometry
+    geometry: SheetGeometry
     pose: np.ndarray
-    laser_mm: np.ndarray
-    fan_slope: float
 
     @classmethod
     def from_sensor(cls, sensor: Sensor, medium: Medium) -> "LineOfSight":
         """Make it for a described sensor; DesignError if the sheet does not cross the camera's axis."""
-        wavelength = sensor.laser.wavelength_nm
-        index, pose = medium.refractive_index(wavelength), camera_from_object(sensor)
-        sine = math.sin(math.radians(sensor.laser.fan_angle_deg / 2)) / index
-        laser_mm = (laser_pose(sensor).origin_mm - pose[:3, 3]) @ pose[:3, :3]
-        window = WindowGeometry((0.0, 0.0, 1.0), 0.0, 0.0, 1.0, 1.0)
-        if sensor.camera.window.mounted:
-            window = WindowGeometry.from_description(sensor.camera.window, medium, wavelength, np.eye(3))
-        return cls(sensor.camera, index, window, pose, laser_mm, sine / math.sqrt(1 - sine**2))
+        return cls(sensor.camera, SheetGeometry.from_description(sensor, medium), camera_from_object(sensor))
 
     def depth_mm(self, z: Array) -> Array:
         """Return the depth along the camera's axis, from the pupil, of points (0, 0, z) in the OCS."""
@@ -61,23 +49,14 @@ class LineOfSight:
 
     def in_image(self, points: np.ndarray, *, margin_px: float = 0.0) -> np.ndarray:
         """Return a mask (N,) of the points (N, 3) inside the image, at least ``margin_px`` from its border."""
-        camera, window = self.camera, self.window
+        camera, window = self.camera, self.geometry.window
         x, y, z = self.pose[:3, :3] @ points.T + self.pose[:3, 3:]
         # The formulas are valid only beyond the window's outer face.
         outside = (dot((x, y, z), window.normal) > window.outer_mm) & (z > 0)
         ahead = np.where(outside, x, 0), np.where(outside, y, 0), np.where(outside, z, 1e3)
-        image, within = project_points(np, Lens.from_description(camera), window, ahead), margin_px - 0.5
+        image, within = self.geometry.project(np, ahead), margin_px - 0.5
         in_width = (image.x >= within) & (image.x <= camera.width_px - 1 - within)
         return outside & in_width & (image.y >= within) & (image.y <= camera.height_px - 1 - within)
-
-    def line_mm(self, z: float) -> np.ndarray:
-        """Return Y values, closely spaced, of the visible line at ``z``; can be empty."""
-        reach = 2 * self.depth_mm(z) * self.camera.corner_slope()
-        middle = -self.pose[:3, 1] @ (self.pose[:3, 3] + self.pose[:3, 2] * z)
-        y = np.linspace(middle - reach, middle + reach, 1001)
-        visible = self.in_image(np.column_stack([np.zeros_like(y), y, np.full_like(y, z)]))
-        lit = np.abs(y - self.laser_mm[1]) <= self.fan_slope * (z - self.laser_mm[2])
-        return y[find_longest_run(visible & lit)]
 
     def half_target_mm(self, z: float, y: float) -> np.ndarray:
         """Return half the sides (2,), X and Y, of a target about (0, y, z) that fills the view.
@@ -158,9 +137,9 @@ def plan_recordings(sensor: Sensor, medium: str, *, reflectance: float) -> Recor
     near, far = find_measured_range(sensor, of_use)
     sight = LineOfSight.from_sensor(sensor, of_use)
     # Middle in Y of the line at the near end, and a length that covers the line at the far end.
-    at_near, at_far = sight.line_mm(near), sight.line_mm(far)
-    y = float(at_near[0] + at_near[-1]) / 2
-    length = 2 * _OVERSIZE * float(max(at_far[-1] - y, y - at_far[0]))
+    at_near, (first, last) = find_line_ends(extract_parameters([sensor], [of_use]), np.array([near, far]))
+    y = float(at_near.mean())
+    length = 2 * _OVERSIZE * float(max(last - y, y - first))
     plane = {"kind": "plate", "position_mm": (0.0, y, 0.0), "reflectance": reflectance}
     plane |= {"width_mm": length, "height_mm": length}
     motion = _plan_travel(near, far, STANDARD_DEPTHS)
@@ -168,10 +147,10 @@ def plan_recordings(sensor: Sensor, medium: str, *, reflectance: float) -> Recor
     standard = PlannedRecording("standard", sensor, scene)
     exposed = Exposure.model_validate(sensor.exposure.model_dump() | {"laser_ms": "auto", "lamp_ms": "auto"})
     calibrated = sensor.model_copy(update={"exposure": exposed})
-    if not (sensor.camera.window.mounted and sight.index > 1 + 1e-6):
+    wavelength, media = sensor.laser.wavelength_nm, dict(sensor.media)
+    if not (sensor.camera.window.mounted and of_use.refractive_index(wavelength) > 1 + 1e-6):
         return Recordings(_target(calibrated, medium, sight, near=near, far=far, y=y), standard, None)
     step = PlannedRecording("step", calibrated, _plan_step(medium, near=near, far=far, y=y, length=length))
-    wavelength, media = sensor.laser.wavelength_nm, dict(sensor.media)
     air = next(
         (name for name, one in media.items() if one.kind == "air" and one.refractive_index(wavelength) == 1), None
     )
@@ -192,15 +171,14 @@ def find_measured_range(sensor: Sensor, medium: Medium) -> tuple[float, float]:
     part of the line in the volume is in view.
     """
     standoff = check_design(sensor, medium).standoff_mm
-    sight, volume = LineOfSight.from_sensor(sensor, medium), sensor.volume
-    forward = sight.pose[2, 2]
+    volume, forward = sensor.volume, camera_from_object(sensor)[2, 2]
     if forward <= 0:
         raise DesignError(
             f"the angle between the laser's and the camera's axes is {math.degrees(math.acos(forward)):.0f} deg; it "
             "must be below 90 deg: turn the laser"
         )
     depths = (np.linspace(volume.near_mm, volume.far_mm, _DEPTHS_TRIED) - standoff) / forward
-    lit = depths[find_longest_run([len(sight.line_mm(z)) > 1 for z in depths])]
+    lit = depths[find_longest_run(np.diff(find_line_ends(extract_parameters([sensor], [medium]), depths))[:, 0] > 0)]
     if len(lit) < 2:
         raise DesignError(
             f"the camera does not see the laser line in the volume from {volume.near_mm:g} to {volume.far_mm:g} mm: "

@@ -45,10 +45,10 @@ class LensRays:
     """
 
     def __init__(self, camera: Camera):
-        focal, focus = camera.focal_length_mm, camera.focus_distance_mm
-        working_f_number = camera.f_number * (1 + focal / (focus - focal))
+        working_f_number = camera.working_f_number()
         self.irradiance_on_axis = opaque(math.pi / 4 / working_f_number**2)
-        self._pupil_radius_mm, self._focus_mm = opaque(0.5 * focal / working_f_number), opaque(focus)
+        self._pupil_radius_mm = opaque(0.5 * camera.focal_length_mm / working_f_number)
+        self._focus_mm = opaque(camera.focus_distance_mm)
         numbers = *camera.focal_lengths_px(), *camera.principal_point()
         self._fx, self._fy, self._cx, self._cy = map(opaque, numbers)
         self._distortion = {name: opaque(value) for name, value in camera.distortion.model_dump().items()}

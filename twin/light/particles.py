@@ -128,10 +128,7 @@ class SpotSampler:
         size_px = 0.5 * shown / np.sqrt(np.maximum(found["across"], 1e-12))
         light_seen, radius = found["light"] * intensity / np.maximum(found["across"], 1e-12), np.hypot(size_px, blur)
         if self.effects.speckle:
-            working = camera.f_number * (
-                1 + camera.focal_length_mm / (camera.focus_distance_mm - camera.focal_length_mm)
-            )
-            grain_px = 1e-3 * self.wavelength_nm * working / camera.pixel_size_um
+            grain_px = 1e-3 * self.wavelength_nm * camera.working_f_number() / camera.pixel_size_um
             grains = np.maximum(1.0, math.pi * np.square(radius / grain_px))
             light_seen = light_seen * rng.gamma(grains) / grains
         spots = Spots(x, y, light_seen, radius)

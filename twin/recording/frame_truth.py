@@ -8,7 +8,7 @@ import numpy as np
 
 from twin.backend.arrays import Float, UInt32, to_jit, to_numpy
 from twin.light.image_sampling import find_marked
-from twin.light.pose import SensorPose, Travel
+from twin.light.pose import Rays, SensorPose, Travel
 from twin.light.renderer import Renderer
 from uwlts.model.placement import camera_from_object
 from uwlts.storage.truth import TruthStatus
@@ -139,20 +139,21 @@ def mark_run(light: np.ndarray, centre: np.ndarray, share: float) -> np.ndarray:
 
 def _compute_distance_slopes(renderer: Renderer, pose: SensorPose, truth: FrameTruth, lines: np.ndarray) -> np.ndarray:
     """Return the derivative of the sheet's distance on the lines' tangent planes across the stripe, in mm/px."""
-    camera, distance = renderer.sensor.camera, []
     point, normal = (mi.Vector3f(*(to_jit(axis) for axis in v[lines].T)) for v in (truth.point_mm, truth.normal))
-    at = to_jit(lines)
+    at, distance = to_jit(lines), []
     for aside in (-0.5, 0.5):
-        across = to_jit(truth.centre_px[lines] + aside)
-        x, y = (at, across) if camera.stripe_along == "width" else (across, at)
-        bundle = renderer.view.trace_bundle(x, y)
-        ray = pose.ray(
-            bundle.origin, bundle.direction, None if pose.travel is None else pose.travel.compute_times(y, 0.5)
-        )
+        bundle, after_s = _trace_lines(renderer, pose, at, to_jit(truth.centre_px[lines] + aside))
+        ray = pose.ray(bundle.origin, bundle.direction, after_s)
         t = dr.dot(normal, point - mi.Vector3f(ray.o)) / dr.dot(normal, ray.d)
         place = mi.Point3f(bundle.origin + bundle.direction * t)
         distance.append(renderer.sheet.evaluate(place).distance_mm.numpy().astype(float))
     return distance[1] - distance[0]
+
+
+def _trace_lines(renderer: Renderer, pose: SensorPose, line: Float, across: Float) -> tuple[Rays, Float | None]:
+    """Return chief rays of places on profile lines, and their times in s after that of the pose; None: at rest."""
+    x, y = (line, across) if renderer.sensor.camera.stripe_along == "width" else (across, line)
+    return renderer.view.trace_bundle(x, y), None if pose.travel is None else pose.travel.compute_times(y, 0.5)
 
 
 def select_brightest(found: Crossings, lines: int) -> FrameTruth:
@@ -186,16 +187,9 @@ def find_crossings(renderer: Renderer, scene_from_object: np.ndarray, *, travel:
     if len(line) == 0:
         return nothing
 
-    def position(across: Float, at: Float) -> tuple[Float, Float]:
-        return (at, across) if along_width else (across, at)
-
-    def travelled(across: Float, at: Float) -> Float | None:
-        return None if travel is None else travel.compute_times(position(across, at)[1], 0.5)
-
     def distance(across: Float, at: Float) -> Float:
-        bundle = renderer.view.trace_bundle(*position(across, at))
-        ray = pose.ray(bundle.origin, bundle.direction, travelled(across, at))
-        hit = renderer.objects.scene.ray_intersect_preliminary(ray)
+        bundle, after_s = _trace_lines(renderer, pose, at, across)
+        hit = renderer.objects.scene.ray_intersect_preliminary(pose.ray(bundle.origin, bundle.direction, after_s))
         light = renderer.sheet.evaluate(bundle.origin + bundle.direction * dr.select(hit.is_valid(), hit.t, 1.0))
         return dr.select(hit.is_valid() & (bundle.weight > 0), light.distance_mm, dr.nan)
 
@@ -232,8 +226,7 @@ def find_crossings(renderer: Renderer, scene_from_object: np.ndarray, *, travel:
         )
     centre = low + (high - low) * below / (below - above)
     dr.eval(centre)
-    bundle = renderer.view.trace_bundle(*position(centre, at))
-    brightness, seen = renderer.laser(pose, bundle, travelled(centre, at))
+    brightness, seen = renderer.laser(pose, *_trace_lines(renderer, pose, at, centre))
     si, offset = seen.si, dr.select(seen.valid, renderer.sheet.evaluate(seen.end()).distance_mm, dr.nan)
     thing = renderer.objects.number(si.shape, seen.valid)
     dr.eval(centre, brightness, si.p, si.n, offset, thing)

@@ -35,7 +35,7 @@ from twin.sensor.detector import (
 )
 from twin.sensor.speckle import Speckle, coherence
 from uwlts.errors import DesignError
-from uwlts.model.placement import camera_from_object
+from uwlts.model.placement import apparent_depth_mm, camera_from_object
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Frame
 
@@ -287,7 +287,7 @@ class SensorSimulator:
         return index * self.period_s if shot.time_s is None else shot.time_s
 
     def frame(self, shot: Shot, index: int) -> Frame:
-        """Return image number ``index`` of the scan with its metadata in the capture."""
+        """Return image number ``index`` of the scan, with its metadata; noise depends only on seed, shot and index."""
         return self.frame_of(self.light(shot, index), shot, index)
 
     def frame_of(self, light: ShotLight, shot: Shot, index: int) -> Frame:
@@ -301,28 +301,21 @@ class SensorSimulator:
             number = course.numbers[shot]
             pose = course.reported[number]
             covariance = None if course.covariance is None else course.covariance[number]
+        exposure_ms = self._choose_exposure(shot)
+        electrons = exposure_ms * self._compute_electrons_per_ms(*light, shot)
         return Frame(
-            self._render_image(light, shot, index),
+            self.detect(electrons, exposure_ms=exposure_ms, noise_seed=[self.options.seed, index]),
             stage_mm=shot.stage_mm,
             laser_on=shot.light == "laser",
-            exposure_ms=self._choose_exposure(shot),
+            exposure_ms=exposure_ms,
             time_s=self._find_time_s(shot, index),
             pose=pose,
             pose_covariance=covariance,
             speed_mm_per_s=self.scene.motion.stage_speed_mm_s(),
         )
 
-    def image(self, shot: Shot, index: int) -> np.ndarray:
-        """Return the grey values (H, W) of a shot; noise depends only on seed, position and index."""
-        return self._render_image(self.light(shot, index), shot, index)
-
-    def _render_image(self, light: ShotLight, shot: Shot, index: int) -> np.ndarray:
-        exposure_ms = self._choose_exposure(shot)
-        electrons = exposure_ms * self._compute_electrons_per_ms(*light, shot)
-        return self.detect(electrons, exposure_ms=exposure_ms, noise_seed=[self.options.seed, index])
-
     def expose(self, shot: Shot, index: int, *, exposure: float = 1.0, bright_share: float = 0.0) -> SimulatedImage:
-        """Return the image of a shot as `image` does, with its light; ``exposure`` multiplies the exposure time.
+        """Return the image of a shot as `frame` does, with its light; ``exposure`` multiplies the exposure time.
 
         An automatic exposure is shortened until at most ``bright_share`` (if not 0) of pixels exceed ``auto_level``.
         """
@@ -384,18 +377,14 @@ class SensorSimulator:
         """Displace the points of a target by its detection errors in this image."""
         for plate, pose in zip(self.scene.objects, self.scene.object_poses(), strict=True):
             if isinstance(plate, PrintedPlate) and plate.detection_std_px > 0:
-                seen = camera_from_object(self.sensor) @ np.linalg.inv(self.pose(shot)) @ pose
-                mm_per_px = self._compute_apparent_depth_mm(seen[2, 3]) / self.sensor.camera.focal_length_px()
+                depth_mm = (camera_from_object(self.sensor) @ np.linalg.inv(self.pose(shot)) @ pose)[2, 3]
+                window, wavelength = self.sensor.camera.window, self.sensor.laser.wavelength_nm
+                if window.mounted:
+                    indices = {"glass_index": window.index(wavelength)}
+                    indices["medium_index"] = self.medium.refractive_index(wavelength)
+                    depth_mm = apparent_depth_mm(depth_mm, window.distance_mm, window.thickness_mm, **indices)
+                mm_per_px = depth_mm / self.sensor.camera.focal_length_px()
                 shift_points(self.renderer.objects.scene, plate, mm_per_px=mm_per_px, image=index)
-
-    def _compute_apparent_depth_mm(self, depth_mm: float) -> float:
-        """Return the apparent depth of a point on the axis: a layer of index n appears n times thinner."""
-        window, wavelength = self.sensor.camera.window, self.sensor.laser.wavelength_nm
-        if not window.mounted:
-            return depth_mm
-        outside = depth_mm - window.distance_mm - window.thickness_mm
-        in_medium = outside / self.medium.refractive_index(wavelength)
-        return window.distance_mm + window.thickness_mm / window.index(wavelength) + in_medium
 
     def _find_exposure(self, light: Light, probe: Literal["scan", "middle"]) -> float:
         """Return the described exposure in ms, or that which brings the brightest shot to the wanted level."""

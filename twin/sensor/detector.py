@@ -279,9 +279,8 @@ def dirt(camera: Camera, share: float, *, seed: int) -> np.ndarray:
     """
     inner = camera.window.distance_mm
     px_per_mm = camera.focal_length_px() / inner
-    focus = camera.focus_distance_mm
-    working = camera.f_number * (1 + camera.focal_length_mm / (focus - camera.focal_length_mm))
-    blur_px = 0.5 * camera.focal_length_mm / working * (1 - inner / focus) * px_per_mm
+    pupil_mm = 0.5 * camera.focal_length_mm / camera.working_f_number()
+    blur_px = pupil_mm * (1 - inner / camera.focus_distance_mm) * px_per_mm
     largest_px = 0.5 * _SPOT_MM[1] * px_per_mm
     margin = math.ceil(blur_px + largest_px)
     # The radius of the smallest spot spans at least `_CELLS_PER_SPOT` cells.

@@ -22,7 +22,8 @@ from uwlts.stripe import StripeOptions, StripeSettings, explain_missing_stripe, 
 from uwlts.stripe.capture_stripes import FEWEST_LINES, find_stripe_direction
 from uwlts.targets import Target, TargetView, parse_target
 
-_SAME_POSITION_MM = 1e-6  # rounding of positions stored as floating-point numbers
+ALONG_Z = 0.9  # least cosine of the angle between the stage's direction and the laser's axis (OCS Z)
+SAME_POSITION_MM = 1e-6  # rounding of positions stored as floating-point numbers
 _MANY_OUTLIERS = 0.05  # fraction of a capture's stripe points above which rejected points give a warning
 _MOST_ROWS = 30  # of the table of images in a refusal
 _LOOKED_AT = 15  # images of a capture that are searched for the reason of a missing stripe
@@ -180,6 +181,15 @@ def common_sensor(
     return sensor
 
 
+def find_approach(captures: Sequence[Capture]) -> bool | None:
+    """Return whether the stage moves the sensor towards the target, which is perpendicular to the OCS's Z.
+
+    None if it does not move the sensor along Z, or in opposite directions in different captures.
+    """
+    along = [capture.header.stage_direction[2] for capture in captures]
+    return min(along) > 0 if min(map(abs, along)) >= ALONG_Z and min(along) * max(along) > 0 else None
+
+
 def step_evidence(
     captures: Sequence[Capture],
     *,
@@ -282,7 +292,7 @@ def _find_target_stripe(
 ) -> tuple[int, TargetStripe] | str:
     """Find the stripe on the target, and the number of the target's image at this position, or return the reason."""
     frame, image = numbered
-    here = np.flatnonzero(np.abs(positions_mm - capture.stage_mm[frame]) <= _SAME_POSITION_MM)
+    here = np.flatnonzero(np.abs(positions_mm - capture.stage_mm[frame]) <= SAME_POSITION_MM)
     if not len(here):
         return f"no target was found at {capture.stage_mm[frame]:g} mm"
     place = int(here[0])

@@ -256,16 +256,15 @@ class _FrameReader:
             place = float(np.interp(middle_s, times, places))
             if not (self._within_mm[0] <= place <= self._within_mm[1] and times[0] <= middle_s <= times[-1]):
                 continue
-            encoder = None if frame.encoder is None else float(frame.encoder)
             exposure_ms = self._exposure_ms if frame.exposure_ms is None else frame.exposure_ms
-            kept = Frame(frame.image, place, True, exposure_ms, middle_s - self._began_s, encoder=encoder)
+            kept = Frame(frame.image, place, True, exposure_ms, middle_s - self._began_s)
             self._writer.append(kept)
             header = self._writer.header
             along, full_dn = header.sensor.camera.stripe_along, header.saturation_dn
             stripe = extract_stripe(frame.image, stripe_along=along, saturation=full_dn)
             self._stripes.append(stripe.centre_px)
             self._times.append(middle_s)
-            self._encoders.append(np.nan if encoder is None else encoder)
+            self._encoders.append(np.nan if frame.encoder is None else frame.encoder)
             self._stored(kept, stripe, len(self._times) - 1)
 
     def assign_positions(

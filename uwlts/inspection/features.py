@@ -280,8 +280,6 @@ class Inspection(Brief):
     deviation_mm : (N,) float64
         Distance of each point of the cloud, without repeated ones, from the undamaged surface, positive outwards; NaN
         for omitted points.
-    level_mm : (N,) float64
-        Least significant depth of an indication of the smallest size at each point; NaN without a search.
     notes : tuple of str
         Limitations of the result.
     """
@@ -289,7 +287,6 @@ class Inspection(Brief):
     kind: str
     features: tuple[Feature, ...]
     deviation_mm: np.ndarray
-    level_mm: np.ndarray
     notes: tuple[str, ...] = ()
 
     def consider_cloud(self, cloud: PointCloud) -> Inspection:

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from uwlts.errors import EvaluationError
-from uwlts.inspection.features import Feature, FeatureKind, FeatureValue
+from uwlts.inspection.features import Feature, FeatureValue
 from uwlts.model.library import read_table, validate_description
 from uwlts.model.sensor import Description, Positive, Vector
 
@@ -158,18 +158,16 @@ def resolve_datum(datum: FindingDatum, axis: np.ndarray) -> tuple[np.ndarray, np
     return direction, across, note
 
 
-def format_place(feature: Feature, whole: Feature | None, start_mm: np.ndarray, datum: FindingDatum) -> tuple[str, str]:
-    """Return clock position and distance from the datum, mm, as text; for objects other than pipes X and Y.
+def format_place(feature: Feature, pipe: Feature, points_mm: np.ndarray, datum: FindingDatum) -> tuple[str, str]:
+    """Return clock position and distance from the datum, mm, of a feature of a pipe as text.
 
-    The clock is read looking along the direction in which distances count. ``start_mm`` (3,) is the datum's place if it
-    states none.
+    The clock is read looking along the direction in which distances count. If the datum states no place, they count
+    from the first of the cloud's points (N, 3).
 
     Raises EvaluationError if the datum's directions do not determine the clock.
     """
-    offset = feature.place_mm - (start_mm if datum.place_mm is None else np.array(datum.place_mm))
-    if whole is None or whole.kind != FeatureKind.PIPE:
-        return f"X {offset[0]:.0f}, Y {offset[1]:.0f}", f"{np.linalg.norm(offset):.0f}"
-    axis, up, _ = resolve_datum(datum, whole.axes[2])
-    about = feature.place_mm - whole.place_mm
+    axis, up, _ = resolve_datum(datum, pipe.axes[2])
+    start = float(np.min(points_mm @ axis)) if datum.place_mm is None else float(np.array(datum.place_mm) @ axis)
+    about = feature.place_mm - pipe.place_mm
     minutes = round(720 * float(np.arctan2(about @ np.cross(axis, up), about @ up)) / (2 * np.pi)) % 720
-    return f"{minutes // 60 or 12}:{minutes % 60:02d}", f"{round(float(offset @ axis))}"
+    return f"{minutes // 60 or 12}:{minutes % 60:02d}", f"{round(float(feature.place_mm @ axis) - start)}"

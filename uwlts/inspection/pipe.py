@@ -125,11 +125,10 @@ def inspect_pipe(
     of_welds, on_welds = _make_weld_features(cloud, form, welds)
     blemishes = _Blemishes(cloud, form, chosen, search, wall_mm)
     features += [*of_welds, *blemishes.measure_all()]
-    deviation, level = np.full(len(cloud), np.nan), np.full(len(cloud), np.nan)
+    deviation = np.full(len(cloud), np.nan)
     deviation[chosen[~search.outliers]] = form.distance_mm[chosen[~search.outliers]]
-    level[chosen] = search.level_mm
     notes = *regions, *_note_limits(cloud, form, search), *of_size, *off, *of_sections, *on_welds, *blemishes.notes
-    found = Inspection("pipe", tuple(features), deviation, level, notes)
+    found = Inspection("pipe", tuple(features), deviation, notes)
     return found.consider_cloud(cloud)
 
 

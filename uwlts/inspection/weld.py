@@ -127,7 +127,7 @@ def inspect_weld(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
     notes += left_out
     if cloud.uncertainty is None:
         notes.append(WITHOUT_UNCERTAINTY)
-    return Inspection("weld", (feature,), deviation, np.full(len(cloud), np.nan), tuple(notes)).consider_cloud(cloud)
+    return Inspection("weld", (feature,), deviation, tuple(notes)).consider_cloud(cloud)
 
 
 @dataclass(frozen=True, eq=False)

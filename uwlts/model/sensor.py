@@ -195,6 +195,10 @@ class Camera(Description):
         """Return the focal lengths in pixels along x and y."""
         return self.focal_length_px(), self.pixel_aspect * self.focal_length_px()
 
+    def working_f_number(self) -> float:
+        """Return the f-number for the magnification m at the described focus: N (1 + m)."""
+        return self.f_number * (1 + self.focal_length_mm / (self.focus_distance_mm - self.focal_length_mm))
+
     def corner_slope(self) -> float:
         """Return the slope in air of the rays to the image's corners, for a principal point in the image's centre."""
         fx, fy = self.focal_lengths_px()

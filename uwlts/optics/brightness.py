@@ -174,8 +174,7 @@ def _make_sheet_function(
         per_mm = ray[:count] @ frame[:3, :3] / slope[:count, None]
         per_px = (found.points_mm[count:, :] - in_camera) @ frame[:3, 2] / _MOVED_PX
         result = np.empty((count, 8))
-        at_start = {"stage_mm": 0.0, "stage_direction": np.array([1.0, 0.0, 0.0])}
-        result[:, :3] = to_object(calibration, in_camera, **at_start)
+        result[:, :3] = to_object(calibration, in_camera)
         result[:, 3:6] = per_mm * (sigma**2)[:, None]
         result[:, 6] = sigma
         # On a surface normal to the laser's axis, Z is constant: the shifts of sheet and pixel cancel in Z.

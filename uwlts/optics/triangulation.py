@@ -136,6 +136,8 @@ _PARALLEL = 1e-12
 # Tolerance of the table of a profile's points.
 _TABLE_TOLERANCE_MM = 1e-7
 
+_ALONG_X = np.array([1.0, 0.0, 0.0])  # direction of a stage that stays at its position 0
+
 # Pixels per block, so that all intermediate results stay in the processor's cache.
 _BLOCK = 4096
 
@@ -154,13 +156,14 @@ def reconstruct_profile(
     centres_px: np.ndarray,
     *,
     medium_index: float,
-    stage_mm: np.ndarray | float,
-    stage_direction: np.ndarray,
+    stage_mm: np.ndarray | float = 0.0,
+    stage_direction: np.ndarray = _ALONG_X,
 ) -> MeasuredPoints:
     """Reconstruct points (N, 3) in the OCS from stripe centres (N,) on lines (N,) of one or several profiles.
 
     Lines are image columns if the stripe runs along the width, else rows. The index is relative to air, and ignored
-    without a window. ``stage_mm`` is one position or (N,); ``stage_direction`` (3,) is the sensor's motion in the OCS.
+    without a window. ``stage_mm`` is one position or (N,), by default 0; ``stage_direction`` (3,) is the sensor's
+    motion in the OCS.
 
     Raises RangeError as for `points_on_sheet` and `stage_travel`.
     """
@@ -192,8 +195,8 @@ def reconstruct_pixels(
     pixels: np.ndarray,
     *,
     medium_index: float,
-    stage_mm: np.ndarray | float,
-    stage_direction: np.ndarray,
+    stage_mm: np.ndarray | float = 0.0,
+    stage_direction: np.ndarray = _ALONG_X,
 ) -> MeasuredPoints:
     """Reconstruct points in the OCS at stage position 0 from pixels (N, 2). Errors are those of `reconstruct_profile`.
 
@@ -229,7 +232,11 @@ def rays_on_sheet(
 
 
 def to_object(
-    calibration: Calibration, points_camera: np.ndarray, *, stage_mm: np.ndarray | float, stage_direction: np.ndarray
+    calibration: Calibration,
+    points_camera: np.ndarray,
+    *,
+    stage_mm: np.ndarray | float = 0.0,
+    stage_direction: np.ndarray = _ALONG_X,
 ) -> np.ndarray:
     """Transform points (N, 3) from the camera frame at ``stage_mm`` to the OCS at stage position 0, mm.
 

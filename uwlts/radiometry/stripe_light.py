@@ -32,7 +32,7 @@ from uwlts.errors import CaptureError
 from uwlts.fitting.local_surface import surface_normals
 from uwlts.model.calibration import Calibration
 from uwlts.model.placement import LaserPose, apparent_depth_mm, laser_pose
-from uwlts.model.sensor import Camera, CaptureHeader, Laser, Sensor, Window
+from uwlts.model.sensor import CaptureHeader, Laser, Sensor, Window
 from uwlts.model.stripe import CaptureStripes, stack_pixels
 from uwlts.optics.camera import directions
 from uwlts.optics.design import WindowGeometry, length_outside_mm, trace_to_points
@@ -149,12 +149,6 @@ def transmission(window: Window, *, wavelength_nm: float, medium_index: float) -
     return faces[0] * faces[1] * math.exp(-window.absorption_per_mm() * window.thickness_mm)
 
 
-def working_f_number(camera: Camera) -> float:
-    """Return the f-number for the magnification m at the described focus: N (1 + m)."""
-    magnified = camera.focal_length_mm / (camera.focus_distance_mm - camera.focal_length_mm)
-    return camera.f_number * (1 + magnified)
-
-
 def defocus_variance(
     sensor: Sensor, calibration: Calibration, depth_mm: np.ndarray, *, medium_index: float
 ) -> np.ndarray:
@@ -163,7 +157,7 @@ def defocus_variance(
     A disc of radius r has the variance r² / 4. Behind the window, depths appear divided by their index.
     """
     camera, window = sensor.camera, calibration.window
-    pupil = 0.5 * camera.focal_length_mm / working_f_number(camera)
+    pupil = 0.5 * camera.focal_length_mm / camera.working_f_number()
     apparent = depth_mm
     if window is not None and camera.window.mounted:
         behind = window.distance_mm, window.thickness_mm
@@ -179,7 +173,7 @@ def _convert_radiance(sensor: Sensor, index: float) -> float:
     to air. Photo-electrons follow from EMVA 1288 release 4, Eq. 4.
     """
     camera, detector, wavelength = sensor.camera, sensor.detector, sensor.laser.wavelength_nm
-    aperture = math.pi / (4 * working_f_number(camera) ** 2)
+    aperture = math.pi / (4 * camera.working_f_number() ** 2)
     area_mm2 = (1e-3 * camera.pixel_size_um) ** 2 / camera.pixel_aspect
     electrons_per_mj = 1e-3 * wavelength / _JOULE_NM * detector.quantum_efficiency
     windows = [

@@ -277,7 +277,6 @@ def write_domain_gap(
     real: Sequence[str | Path] = (),
     out: str | Path,
     most_images: int = 200,
-    title: str = "Generated and real stripes",
     stripe: StripeSettings = None,
     overwrite: bool = False,
     progress: ProgressListener = ignore_progress,
@@ -299,8 +298,6 @@ def write_domain_gap(
         Page to write; all figures go into a JSON file of the same name.
     most_images : int
         Largest number of images of each set, evenly chosen.
-    title : str
-        Title of the page.
     stripe : StripeOptions or dict, optional
         Options for finding the stripe, all or some: see `uwlts.StripeOptions`.
     overwrite : bool
@@ -327,7 +324,7 @@ def write_domain_gap(
     text = render_page(
         "uwlts.report",
         "domain.html.j2",
-        title=title,
+        title="Generated and real stripes",
         gaps=found.gap_table() if found.real else None,
         covered=found.covered_table() if found.real and found.generated else None,
         statistics=found.statistics_table(),

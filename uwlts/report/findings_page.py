@@ -353,15 +353,10 @@ def _list_findings(
     listed: Sequence[Feature], found: Inspection, cloud: PointCloud, order: FindingOrder
 ) -> tuple[tuple[str, ...], list[tuple[str, tuple[str, ...]]]]:
     """Return headings and rows of the first page: verdict, and texts on verdict, place and size of every finding."""
-    whole = found.features[0]
-    start = cloud.points_mm.min(axis=0)
-    if whole.kind == FeatureKind.PIPE:
-        start = cloud.points_mm[int(np.argmin(cloud.points_mm @ resolve_datum(order.datum, whole.axes[2])[0]))]
-    clock = "clock" if whole.kind == FeatureKind.PIPE else "place / mm"
-    rows = []
+    whole, rows = found.features[0], []
     for each in listed:
         verdict, names = judge_feature(each, order.limits)
-        at = format_place(each, whole, start, order.datum) if each is not whole else (MISSING, MISSING)
+        at = format_place(each, whole, cloud.points_mm, order.datum) if each is not whole else (MISSING, MISSING)
         size = {value.name: format_interval(value) for value in each.values}
         first = next(iter(names), each.values[0].name)
         said = f"{verdict} ({', '.join(names)})" if names else verdict
@@ -369,7 +364,7 @@ def _list_findings(
         main = next((size[name] for name in _MAIN if name in size), f"{first} {size[first]}")
         more = tuple(size.get(name, MISSING) for name in ("remaining wall", "length", "width"))
         rows.append((verdict, (each.title, said, *at, main, *more)))
-    heads = "finding", "verdict", clock, "from datum / mm", "depth or height / mm"
+    heads = "finding", "verdict", "clock", "from datum / mm", "depth or height / mm"
     return (*heads, "remaining wall / mm", "length / mm", "width / mm"), rows
 
 

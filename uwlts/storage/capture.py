@@ -6,8 +6,7 @@ checksum) and, per frame, ``stage_mm``, ``pose`` (4, 4), ``laser_on``, ``exposur
 artefact and provenance. Nothing in the file is ever executed, and real and synthetic captures have the same structure.
 
 A capture of a moving stage (version 2) has ``speed_mm_per_s (N,)``, positive for growing positions, and the stage's
-reports during the motion: ``stage_reports (M, 2)`` with time in s on the frames' clock and position in mm. ``encoder
-(N,)`` is the encoder count of each frame, or NaN.
+reports during the motion: ``stage_reports (M, 2)`` with time in s on the frames' clock and position in mm.
 
 During recording the file is called ``NAME.part`` and every frame is flushed in HDF5's single-writer mode, so that an
 interrupted recording keeps all its complete frames. Closing the file renames it.
@@ -48,8 +47,8 @@ PER_FRAME: dict[str, tuple[tuple[int, ...], type]] = {"stage_mm": ((), float), "
 PER_FRAME |= {"laser_on": ((), bool), "exposure_ms": ((), float), "time_s": ((), float)}
 """Columns of every capture, with the shape and the type of one frame's value."""
 COVARIANCE = "pose_covariance"
-MORE: dict[str, tuple[tuple[int, ...], type]] = dict.fromkeys(("encoder", "speed_mm_per_s"), ((), float))
-"""Columns of version 2."""
+SPEED = "speed_mm_per_s"
+"""Column of a moving stage."""
 POSE_ROUNDED = 1e-4
 """Largest deviation of a pose's elements from a rotation, for tables with four or more decimals."""
 
@@ -59,8 +58,7 @@ class Frame:
     """An image (H, W) of uint8 or uint16 with stage position, light, exposure, time, and pose if known.
 
     ``pose`` (4, 4) is ``T_scene_object``, or that of the platform if the capture states a mount. ``pose_covariance``
-    (6, 6) is that of the shift in mm, then of a further rotation in rad about the scene's axes, if known. ``encoder``
-    is the encoder count, if any.
+    (6, 6) is that of the shift in mm, then of a further rotation in rad about the scene's axes, if known.
 
     For a moving stage, position and time are those at the middle of the exposure; with a rolling shutter, of the
     image's middle row.
@@ -72,7 +70,6 @@ class Frame:
     exposure_ms: float
     time_s: float
     pose: np.ndarray | None = None
-    encoder: float | None = None
     speed_mm_per_s: float = 0.0
     pose_covariance: np.ndarray | None = None
 
@@ -157,8 +154,6 @@ class Capture(AbstractContextManager["Capture"]):
         the platform, ``T_scene_platform``, if the header states ``T_platform_sensor``.
     pose_covariance : (N, 6, 6) float64 or None
         Covariance of each pose (`Frame`), all NaN if unknown; None in captures without any.
-    encoder : (N,) float64
-        Encoder count at each frame; NaN without an encoder.
     speed_mm_per_s : (N,) float64
         Speed of the stage at each frame, positive for growing positions; 0 at rest.
     stage_reports : (M, 2) float64
@@ -200,15 +195,13 @@ class Capture(AbstractContextManager["Capture"]):
         images = self._open_dataset("frames", (camera.height_px, camera.width_px), "u")
         if images.chunks != (1, *images.shape[1:]) or images.dtype.itemsize > 2:
             raise CaptureError(f"{self.path} is damaged: frames are {images.dtype} in chunks of {images.chunks}")
-        held = PER_FRAME | {name: each for name, each in MORE.items() if name in self.file}
+        held = PER_FRAME | ({SPEED: ((), float)} if SPEED in self.file else {})
         columns = {name: self._open_column(name, shape, np.dtype(kind).kind) for name, (shape, kind) in held.items()}
         self._images, self.dtype = images, images.dtype.newbyteorder("=")
         self.moving = "stage_reports" in self.file
         self._count = min(map(len, (images, *columns.values())))
-        self.encoder, self.speed_mm_per_s = (
-            read_values(columns[name], slice(self._count)) if name in columns else np.full(self._count, usual)
-            for name, usual in zip(MORE, (np.nan, 0.0), strict=True)
-        )
+        speed = columns.get(SPEED)
+        self.speed_mm_per_s = np.zeros(self._count) if speed is None else read_values(speed, slice(self._count))
         reports = self._open_column("stage_reports", (2,), "f") if self.moving else None
         self.stage_reports = np.empty((0, 2)) if reports is None else read_values(reports)
         # HDF5 returns zeros for chunks that were never stored.
@@ -227,7 +220,7 @@ class Capture(AbstractContextManager["Capture"]):
         if unfinished and self._count > 1 and self.time_s[-1] < self.time_s[-2]:
             # The writer was killed between extending the datasets and storing its last frame.
             self._count -= 1
-            for name in (*PER_FRAME, *MORE, *([] if self.pose_covariance is None else [COVARIANCE])):
+            for name in (*PER_FRAME, SPEED, *([] if self.pose_covariance is None else [COVARIANCE])):
                 setattr(self, name, getattr(self, name)[: self._count])
         if (np.diff(self.time_s) < 0).any():
             raise CaptureError(f"{self.path} holds times that decrease")
@@ -298,8 +291,7 @@ class Capture(AbstractContextManager["Capture"]):
         index = index + self._count if index < 0 else index
         image = self.image(index)
         columns = (self.stage_mm, self.laser_on, self.exposure_ms, self.time_s)
-        known = {"speed_mm_per_s": self.speed_mm_per_s[index].item()}
-        known["encoder"] = self.encoder[index].item() if np.isfinite(self.encoder[index]) else None
+        known = {SPEED: self.speed_mm_per_s[index].item()}
         for name, values in (("pose", self.pose), (COVARIANCE, self.pose_covariance)):
             known[name] = values[index] if values is not None and np.isfinite(values[index]).all() else None
         return Frame(image, *(column[index].item() for column in columns), **known)

@@ -20,9 +20,9 @@ from uwlts.storage.capture import (
     CAPTURES,
     COVARIANCE,
     FORMAT,
-    MORE,
     PER_FRAME,
     POSE_ROUNDED,
+    SPEED,
     VERSION,
     Capture,
     Frame,
@@ -69,7 +69,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         self._frame_bytes = camera.height_px * camera.width_px * self._dtype.itemsize
         self._moving = moving
         self._columns: dict[str, tuple[tuple[int, ...], type]] = {COVARIANCE: ((6, 6), float)} if covariances else {}
-        self._columns |= MORE if moving else {}
+        self._columns |= {SPEED: ((), float)} if moving else {}
         # The time is written last: its length is the number of frames.
         self._columns |= PER_FRAME
         if self._dtype not in (np.uint8, np.uint16):
@@ -258,5 +258,5 @@ def _dump_recording(header: CaptureHeader, dtype: np.dtype, plan: Table | None, 
 
 def _list_data_sets(file: h5py.File) -> dict[str, h5py.Dataset]:
     """Return the datasets of a capture by name."""
-    names = ("frames", "stage_reports", *MORE, COVARIANCE, *PER_FRAME)
+    names = ("frames", "stage_reports", SPEED, COVARIANCE, *PER_FRAME)
     return {name: cast(h5py.Dataset, file[name]) for name in names if name in file}

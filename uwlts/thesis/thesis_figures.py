@@ -195,9 +195,7 @@ def mm_per_px(calibration: Calibration, medium_index: float) -> float:
     camera = calibration.camera
     across = np.array([0.0, 0.5] if calibration.stripe_along == "width" else [0.5, 0.0])
     pixels = np.array([camera.cx_px, camera.cy_px]) + np.array([-across, across])
-    points = reconstruct_pixels(
-        calibration, pixels, medium_index=medium_index, stage_mm=0.0, stage_direction=np.array([1.0, 0.0, 0.0])
-    ).points_mm
+    points = reconstruct_pixels(calibration, pixels, medium_index=medium_index).points_mm
     return float(abs(points[1, 2] - points[0, 2]))
 
 

@@ -61,7 +61,7 @@ def test_steps_of_coordinates_widen_lengths_only() -> None:
     )
     nothing = np.zeros(3)
     pipe = Feature(FeatureKind.PIPE, "pipe", values, nothing, np.eye(3), nothing, np.arange(4))
-    whole = Inspection("pipe", (pipe,), nothing, nothing)
+    whole = Inspection("pipe", (pipe,), nothing)
     cloud = PointCloud(np.zeros((1, 3)), np.ones(1), np.zeros(1, int), np.zeros(1, int), metadata={STEP: 1.2})
     (wider,) = whole.consider_cloud(cloud).features
     assert wider["diameter"].systematic == pytest.approx(1.2 / np.sqrt(12)) and wider["axis slope 1"] == values[1]

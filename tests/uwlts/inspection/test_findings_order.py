@@ -57,17 +57,17 @@ def test_the_most_severe_finding_is_first():
 )
 def test_the_clock_is_read_along_the_direction(place, clock):
     datum = FindingDatum(place_mm=(0, 0, 10), direction=(0, 0, 1), twelve_o_clock=(0, 1, 0))
-    assert format_place(pit("pit", 1, place=place), PIPE, np.zeros(3), datum) == (clock, "20")
+    assert format_place(pit("pit", 1, place=place), PIPE, np.zeros((1, 3)), datum) == (clock, "20")
     back = FindingDatum(place_mm=(0, 0, 40), direction=(0, 0, -1), twelve_o_clock=(0, 1, 0))
     hours, minutes = map(int, clock.split(":"))
     mirrored = (720 - 60 * (hours % 12) - minutes) % 720
     expected = f"{mirrored // 60 or 12}:{mirrored % 60:02d}", "10"
-    assert format_place(pit("pit", 1, place=place), PIPE, np.zeros(3), back) == expected
+    assert format_place(pit("pit", 1, place=place), PIPE, np.zeros((1, 3)), back) == expected
 
 
 def test_directions_that_do_not_determine_the_clock_are_refused():
     with pytest.raises(EvaluationError, match="does not determine the clock"):
-        format_place(pit("pit", 1), PIPE, np.zeros(3), FindingDatum(direction=(0, 0, 1), twelve_o_clock=(0, 0, 1)))
+        format_place(pit("pit", 1), PIPE, np.zeros((1, 3)), FindingDatum(direction=(0, 0, 1), twelve_o_clock=(0, 0, 1)))
 
 
 @pytest.mark.parametrize("axis", [axis for axis in product((-1, 0, 1), repeat=3) if any(axis)])

@@ -99,7 +99,7 @@ def test_page_json_and_pdf_say_the_same(folder, chromium, monkeypatch):
 @pytest.mark.parametrize(("omitted", "more"), [(0, ""), (50, " 25 % of the points are not inspected.")])
 def test_the_conclusion_says_how_much_is_not_inspected(omitted, more):
     """A second body covers a quarter of a pipe."""
-    found = Inspection("pipe", (), np.where(np.arange(200) < omitted, np.nan, 0.0), np.zeros(200))
+    found = Inspection("pipe", (), np.where(np.arange(200) < omitted, np.nan, 0.0))
     assert _conclude([], FindingOrder(), found) == ("no limit", "No finding." + more)
     pit = Feature(FeatureKind.PIT, "pit 1", (), np.zeros(3), np.eye(3), np.zeros(3), np.arange(3))
     assert _conclude([pit, pit], FindingOrder(), found) == ("no limit", "Findings: 2 × no limit." + more)

@@ -61,7 +61,7 @@ def test_values_of_an_inspection():
     pit = Feature(FeatureKind.PIT, "pit 1", tuple(values), place, np.eye(3), np.ones(3), np.zeros(9, int), 1e-6)
     pipe = [plain_value(FeatureKind.PIPE, "diameter", 200.0, 0.01, None)]
     whole = Feature(FeatureKind.PIPE, "pipe", tuple(pipe), place, np.eye(3), np.ones(3), np.zeros(0, int))
-    frame = uwlts.report.to_frame(Inspection("pipe", (whole, pit), np.zeros(9), np.zeros(9)))
+    frame = uwlts.report.to_frame(Inspection("pipe", (whole, pit), np.zeros(9)))
     assert list(frame["feature_name"]) == ["pipe", "pit 1", "pit 1"] and list(frame["unit"]) == ["mm"] * 3
     assert list(frame["name"]) == ["diameter", "depth", "remaining wall"]
     np.testing.assert_allclose(frame["uncertainty"], [0.01, 0.05, 0.1])

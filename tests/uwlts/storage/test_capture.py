@@ -112,10 +112,10 @@ def test_everything_comes_back(tmp_path: Path, dtype: type, with_pose: bool):
         assert capture.laser_on.dtype == bool
 
 
-def test_a_moving_stage_has_speeds_counts_and_reports(tmp_path: Path):
+def test_a_moving_stage_has_speeds_and_reports(tmp_path: Path):
     path, written = tmp_path / "m.h5", {"dtype": np.dtype(np.uint8), "moving": True}
     with pytest.raises(KeyboardInterrupt), CaptureWriter(path, a_header(), **written) as writer:
-        writer.append(replace(a_frame(0), encoder=7.0, speed_mm_per_s=3.0))
+        writer.append(replace(a_frame(0), speed_mm_per_s=3.0))
         raise KeyboardInterrupt
     with pytest.raises(CaptureError, match="belongs to another recording"):
         CaptureWriter(path, a_header(), dtype=np.dtype(np.uint8), resume=True)
@@ -125,7 +125,6 @@ def test_a_moving_stage_has_speeds_counts_and_reports(tmp_path: Path):
     with Capture(path) as capture:
         assert capture.moving and capture.stage_reports.shape == (3, 2)
         assert capture.stage_mm.tolist() == [0.5, 0.75] and capture.speed_mm_per_s.tolist() == [2.5, 2.5]
-        assert (capture[0].encoder, capture[1].encoder) == (7.0, None)
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])

@@ -14,6 +14,7 @@ from uwlts.calibration.capture_evidence import (
     common_sensor,
     explain_captures_without_stripe,
     find_air_evidence,
+    find_approach,
     step_evidence,
 )
 from uwlts.calibration.joint.parameters import SHEET, Prior, ViewMedium, fan_priors, window_priors
@@ -148,10 +149,7 @@ def gather_jointly(
         found = find_air_evidence(captures, stripe=options.stripe, progress=progress)
         warnings += found.warnings
         directions = [capture.header.stage_direction for capture in captures]
-        # The stage moves the sensor towards the target, or away; None if it does not move along the OCS's Z.
-        along = [float(direction[2]) for direction in directions]
-        approach = min(along) > 0 if min(map(abs, along)) >= 0.9 and min(along) * max(along) > 0 else None
-        series.append(Series(view, found, approach, directions))
+        series.append(Series(view, found, find_approach(captures), directions))
     for capture in steps:
         view, index = _identify_view(capture, media), options.medium_index
         found_steps, left_out = step_evidence([capture], medium_index=index, stripe=options.stripe, progress=progress)

@@ -7,6 +7,7 @@ from itertools import chain, count
 
 import numpy as np
 from pydantic import JsonValue
+from scipy.linalg import block_diag
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
@@ -187,11 +188,6 @@ def unused_name(name: str, taken: Collection[str]) -> str:
     return next(each for each in names if each not in taken)
 
 
-def append_independent(covariance: np.ndarray, std: Sequence[float]) -> np.ndarray:
-    """Extend a covariance (P, P) by independent quantities with these standard uncertainties."""
-    return np.pad(covariance, (0, len(std))) + np.diag([*[0.0] * len(covariance), *np.square(std)])
-
-
 def require_joint(calibration: Calibration) -> JointEstimate:
     """Return the joint estimate of a calibration; raises CalibrationError if it contains none."""
     if calibration.joint is None:
@@ -242,7 +238,7 @@ def _read_estimate(
         media.append(unused_name("the scan", media))
         keys.append(MediumIndex(media[-1]))
         values = np.append(values, calibration.medium_index(medium))
-        covariance = append_independent(covariance, [medium.index_uncertainty(calibration.wavelength_nm, uncertainty)])
+        covariance = block_diag(covariance, medium.index_uncertainty(calibration.wavelength_nm, uncertainty) ** 2)
     lens = len(intrinsics.names)
     if tuple(keys[:lens]) != intrinsics.keys:
         raise _make_damage_error("its parameters are inconsistent with the camera")

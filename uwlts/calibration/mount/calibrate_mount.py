@@ -36,7 +36,7 @@ from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.files.reading import is_regular_file
 from uwlts.model.calibration import Calibration, rigid_transform
 from uwlts.model.mount import Mount, MountPose
-from uwlts.model.sensor import Table
+from uwlts.model.sensor import Table, to_rows
 from uwlts.model.trajectory import Trajectory
 from uwlts.shapes.profile_curves import LEAST_POINTS
 from uwlts.storage.calibration_file import resolve_calibration
@@ -354,8 +354,8 @@ class _Calibration:
         transform = rigid_transform(Rotation.from_matrix(state.rotation).as_matrix(), state.translation)
         weights = used.counts / used.counts.sum()
         return Mount(
-            T_platform_sensor=tuple(tuple(row) for row in transform.tolist()),
-            covariance=tuple(tuple(row) for row in covariance[:6, :6].tolist()),
+            T_platform_sensor=to_rows(transform),
+            covariance=to_rows(covariance[:6, :6]),
             coverage_factor=factor,
             artefact=found,
             robot_scale=state.scale if used.scale else None,

@@ -12,6 +12,7 @@ from uwlts.calibration.mount.restricted_likelihood import RestrictedEstimate
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.calibration import Calibration, calibration_digest
 from uwlts.model.mount import SensorShare
+from uwlts.model.sensor import to_rows
 from uwlts.optics.fitness import check_fits
 from uwlts.optics.triangulation import reconstruct_profile
 from uwlts.storage.capture import Capture
@@ -58,8 +59,6 @@ def reconstruct_profiles(
         stripes.line,
         stripes.centre_px,
         medium_index=calibration.medium_index(capture.header.medium),
-        stage_mm=0.0,
-        stage_direction=np.array([1.0, 0.0, 0.0]),
     ).points_mm
     times = capture.time_s[laser]
     at = capture.pose[laser] if poses is None else poses
@@ -125,7 +124,7 @@ def _add_sensor_uncertainty(
     total = estimated + in_true_frame @ known.covariance @ in_true_frame.T
     share = SensorShare(
         calibration=calibration_digest(known.calibration),
-        by_parameters=tuple(tuple(row) for row in by_parameters[:6, :count].tolist()),
-        covariance_apart=tuple(tuple(row) for row in ((independent + independent.T) / 2)[:6, :6].tolist()),
+        by_parameters=to_rows(by_parameters[:6, :count]),
+        covariance_apart=to_rows(((independent + independent.T) / 2)[:6, :6]),
     )
     return (total + total.T) / 2, share

@@ -161,7 +161,7 @@ def mount_by_board(
     rms_px = float(np.sqrt(np.mean([image.rms_px**2 for image in used.images])))
     return Mount(
         T_platform_sensor=to_rows(state[0]),
-        covariance=tuple(tuple(row) for row in covariance[:6, :6].tolist()),
+        covariance=to_rows(covariance[:6, :6]),
         coverage_factor=factor,
         artefact=BoardFound(T_base_target=to_rows(state[1])),
         point_std_mm=rms_px * distance / camera.model.fx_px,

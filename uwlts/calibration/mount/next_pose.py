@@ -13,6 +13,7 @@ from uwlts.errors import CalibrationError
 from uwlts.fitting.next_observation import Candidate, CovarianceRoot, rank_candidates
 from uwlts.model.calibration import rigid_transform
 from uwlts.model.mount import NextPose
+from uwlts.model.sensor import to_rows
 
 _TURN_RAD = np.radians(30)  # rotation that a robot easily makes with the artefact in view
 _LEAST_TURN_RAD = np.radians(5.0)  # RMS rotation about an axis below which a warning is given
@@ -47,10 +48,10 @@ def next_pose(
     ranked = rank_candidates(known, to_point, _generate_candidates(problem, state, scatter, sheet, names))
     if not ranked:
         return None
-    best, pose = ranked[0], ranked[0].candidate.pose.tolist()
+    best = ranked[0]
     return NextPose(
         words=best.candidate.words,
-        T_base_platform=tuple(tuple(row) for row in pose),
+        T_base_platform=to_rows(best.candidate.pose),
         before_mm=best.before,
         after_mm=best.after,
     )

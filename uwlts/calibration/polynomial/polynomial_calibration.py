@@ -15,7 +15,7 @@ from pydantic import JsonValue
 from scipy.spatial import ConvexHull
 
 from uwlts.calibration.camera.camera_parameters import TargetImage
-from uwlts.calibration.capture_evidence import AirEvidence, common_sensor, find_air_evidence
+from uwlts.calibration.capture_evidence import ALONG_Z, SAME_POSITION_MM, AirEvidence, common_sensor, find_air_evidence
 from uwlts.errors import CalibrationError, RangeError
 from uwlts.fitting.least_squares import DEFAULT_K, robust_std
 from uwlts.model.calibration import PolynomialCalibration
@@ -102,8 +102,6 @@ def _compute_terms(points: np.ndarray, low: np.ndarray, high: np.ndarray, degree
     return products[:, powers <= degree]
 
 
-_SAME_POSITION_MM = 1e-6  # rounding of positions stored as floating-point numbers
-_ALONG_Z = 0.9  # cosine of the angle between the stage's direction and the laser's axis
 _ORIGIN_POINTS = 100  # stripe points near the camera's axis that define the origin of the OCS
 
 
@@ -137,7 +135,7 @@ def common_header(captures: Sequence[Capture]) -> CaptureHeader:
         if capture.header.target is None:
             raise CalibrationError(f"{capture.path.name} does not describe its target in its header")
     direction = captures[0].header.stage_direction
-    if abs(direction[2]) < _ALONG_Z:
+    if abs(direction[2]) < ALONG_Z:
         raise CalibrationError(
             f"the stage must move the sensor along the laser's axis (OCS Z); stage_direction is {direction}"
         )
@@ -177,7 +175,7 @@ def stripes_on_plate(
         else:
             warnings.append(f"stage position {image.stage_mm:g} mm: left out, the stripe is not on the target")
     positions = np.sort([stage for *_, stage in parts])
-    different = int(np.count_nonzero(np.diff(positions) > _SAME_POSITION_MM)) + 1 if len(positions) else 0
+    different = int(np.count_nonzero(np.diff(positions) > SAME_POSITION_MM)) + 1 if len(positions) else 0
     if evidence.no_stripe:
         raise CalibrationError(evidence.no_stripe)
     if different <= degree:
@@ -219,9 +217,7 @@ def object_coordinates(stripes: PlateStripes, header: CaptureHeader) -> tuple[np
 
     nominal = nominal_calibration(header.sensor, header.medium)
     index = header.medium.refractive_index(nominal.wavelength_nm)
-    seen = reconstruct_pixels(
-        nominal, stripes.pixels, medium_index=index, stage_mm=0.0, stage_direction=np.array([0.0, 0.0, 1.0])
-    )
+    seen = reconstruct_pixels(nominal, stripes.pixels, medium_index=index)
     known = np.flatnonzero(seen.status == RayStatus.OK)
     if not len(known):
         raise CalibrationError(

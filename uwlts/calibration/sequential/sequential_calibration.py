@@ -21,6 +21,7 @@ from uwlts.calibration.capture_evidence import (
     common_sensor,
     explain_captures_without_stripe,
     find_air_evidence,
+    find_approach,
     step_evidence,
 )
 from uwlts.calibration.sequential.sheet_fit import (
@@ -113,7 +114,7 @@ class Evidence:
     sensor: Sensor  # as described by the captures of the target
     medium_kind: Literal["air", "fresh", "sea", "custom"]  # kind of the medium of the target's images
     stage_direction: np.ndarray  # (3,); nominal direction of the stage for the target, in the OCS
-    approaching: bool | None  # whether the stage moves the sensor towards the target; None if irrelevant
+    approaching: bool  # whether the stage moves the sensor towards the target; unused for free poses
     air: AirEvidence
     window: Window | None  # description of the camera's window for the step standard; None without step captures
     steps: list[StepEvidence]
@@ -166,6 +167,14 @@ def gather(
         )
     sources = sources_of(air, steps)
     found = find_air_evidence(air, stripe=options.stripe, progress=progress)
+    approaching = find_approach(air)
+    if approaching is None and options.poses != "free":
+        along = sorted({capture.header.stage_direction[2] for capture in air})
+        raise CalibrationError(
+            "the stage must move the sensor along the laser's axis (OCS Z), in the same direction in all captures; "
+            f"the captures' stage_direction has the Z component {', '.join(f'{z:.2f}' for z in along)}: use "
+            "poses='free' with a tilted target"
+        )
     warnings = [*found.warnings, *_warn_of_window(air, steps, options)]
     on_steps: list[StepEvidence] = []
     if steps:
@@ -179,7 +188,7 @@ def gather(
         sensor=sensor,
         medium_kind=air[0].header.medium.kind,
         stage_direction=np.array(air[0].header.stage_direction),
-        approaching=None if options.poses == "free" else _find_approach(air),
+        approaching=approaching is not False,
         air=found,
         window=steps[0].header.sensor.camera.window if steps else None,
         steps=on_steps,
@@ -274,8 +283,8 @@ def _calibrate_camera(
     """
     air = evidence.air
     width_px, height_px = evidence.sensor.camera.width_px, evidence.sensor.camera.height_px
-    approaching = evidence.approaching is not False
     diameter_mm = air.target.circle_diameter_mm if options.correct_circles else None
+    approaching = evidence.approaching
     solved = partial(
         solve_camera, width_px=width_px, height_px=height_px, approaching=approaching, circle_diameter_mm=diameter_mm
     )
@@ -344,18 +353,6 @@ def _list_lens_figures(lens: LensCalibration, found: AirEvidence) -> dict[str, J
         "images_left_out": len(lens.left_out),
         "image_table": table,
     }
-
-
-def _find_approach(air: Sequence[Capture]) -> bool:
-    """Return whether the stage moves the sensor towards the target, which is perpendicular to the OCS's Z."""
-    along = {capture.header.stage_direction[2] / np.linalg.norm(capture.header.stage_direction) for capture in air}
-    if min(map(abs, along)) < 0.9 or min(along) * max(along) < 0:
-        raise CalibrationError(
-            "the stage must move the sensor along the laser's axis (OCS Z), in the same direction in all captures; "
-            f"the captures' stage_direction has the Z component {', '.join(f'{z:.2f}' for z in sorted(along))}: use "
-            "poses='free' with a tilted target"
-        )
-    return bool(min(along) > 0)
 
 
 def _warn_of_window(air: Sequence[Capture], steps: Sequence[Capture], options: CalibrationOptions) -> list[str]:

@@ -15,7 +15,7 @@ from uwlts.calibration.capture_evidence import StepEvidence
 from uwlts.errors import CalibrationError, EvaluationError
 from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.sensor import Uncertainty
-from uwlts.optics.triangulation import points_on_sheet
+from uwlts.optics.triangulation import reconstruct_pixels
 from uwlts.shapes.flat import Line, Plane
 from uwlts.shapes.step import StepFace, label_step_faces, step_height
 
@@ -55,9 +55,8 @@ def step_profile(
     calibration: Calibration, window: WindowModel | None, pixels: np.ndarray, *, medium_index: float
 ) -> np.ndarray:
     """Return points (N, 2) of a profile, Y and Z of the OCS in mm, through a window; else NaN."""
-    seen = points_on_sheet(calibration.model_copy(update={"window": window}), pixels, medium_index=medium_index)
-    object_from_camera = np.linalg.inv(calibration.object_transform())
-    return seen.points_mm @ object_from_camera[1:3, :3].T + object_from_camera[1:3, 3]
+    placed = calibration.model_copy(update={"window": window})
+    return reconstruct_pixels(placed, pixels, medium_index=medium_index).points_mm[:, 1:]
 
 
 def label_step(calibration: Calibration, window: WindowModel | None, step: StepEvidence) -> StepImage:
