@@ -29,7 +29,7 @@ def circles_table() -> str:
         along = {"direction": (0.0, 0.0, 1.0), "start_mm": stage, "count": 1, "lights": ("lamp",)}
         scene = load_scene("target", motion=along)
         studio = SensorSimulator(sensor, scene, Options(spp=64))
-        image = studio.image(next(scene.motion.shots()), 0)
+        image = studio.frame(next(scene.motion.shots()), 0).image
         truth = _true_images(sensor, scene.objects[0], stage)
         methods = {
             "thesis's processing": ellipses_of_contours(image),

@@ -150,7 +150,7 @@ def measure(case: Case) -> Frames:
         studio = SensorSimulator(sensor.model_copy(update={"exposure": exposure}), scene, studio.options)
     truths, centres, widths, crop, corner = [], [], [], None, (0, 0)
     for index, shot in enumerate(scene.motion.shots()):
-        truth, image = find_true_stripe(studio.renderer, studio.pose(shot)), studio.image(shot, index)
+        truth, image = find_true_stripe(studio.renderer, studio.pose(shot)), studio.frame(shot, index).image
         truths.append(truth)
         found = {name: extract_stripe(image, stripe_along="width", options=wanted) for name, wanted in METHODS.items()}
         widths.append(found[CROSSING].width_px)

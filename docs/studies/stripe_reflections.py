@@ -255,7 +255,7 @@ def rendered(of: Scene, sensor: Sensor, options: Options = Options()) -> Rendere
 
     studio, images, lit = SensorSimulator(sensor, of, options), [], []
     for number, shot in enumerate(of.motion.shots()):
-        images.append(studio.image(shot, number))
+        images.append(studio.frame(shot, number).image)
         found = find_crossings(studio.renderer, studio.pose(shot))
         shone = found.brightness > 0
         lit.append(np.column_stack([np.full(shone.sum(), number), found.line[shone], found.centre_px[shone]]))

@@ -174,7 +174,7 @@ def pipeline() -> list[Row]:
         calibration = nominal_calibration(sensor, medium)
         index = medium.refractive_index(sensor.laser.wavelength_nm)
         shots = list(scene.motion.shots())
-        image = SensorSimulator(sensor, scene, Options()).image(shots[len(shots) // 2], 0)
+        image = SensorSimulator(sensor, scene, Options()).frame(shots[len(shots) // 2], 0).image
         extract = partial(
             extract_stripe,
             image,
@@ -200,7 +200,7 @@ def pipeline() -> list[Row]:
     scene = load_scene("target")
     target = parse_target(scene.target)
     lamp = next(shot for shot in scene.motion.shots() if shot.light == "lamp")
-    image = SensorSimulator(load_sensor("thesis"), scene, Options()).image(lamp, 0)
+    image = SensorSimulator(load_sensor("thesis"), scene, Options()).frame(lamp, 0).image
     seconds = median_seconds(lambda k: target.detect(image), runs=11)
     found = len(target.detect(image).pixels)
     labelled = Floor("OpenCV's connected components of the image", connected_parts_seconds(image), 30.0)

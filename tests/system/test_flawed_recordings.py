@@ -63,7 +63,7 @@ def photographed(sensor: Sensor, folder: Path, *effects: str) -> Sensor:
     )
     studio = Tripod(sensor, scene, Options(flaws=Flaws.parse(*effects)))
     for number, shot in enumerate(scene.motion.shots()):
-        assert cv2.imwrite(str(folder / f"board{number}.png"), studio.image(shot, number))
+        assert cv2.imwrite(str(folder / f"board{number}.png"), studio.frame(shot, number).image)
     (folder / "target.toml").write_text(tomli_w.dumps(TARGET))
     return studio.sensor
 

@@ -287,7 +287,7 @@ class SensorSimulator:
         return index * self.period_s if shot.time_s is None else shot.time_s
 
     def frame(self, shot: Shot, index: int) -> Frame:
-        """Return image number ``index`` of the scan with its metadata in the capture."""
+        """Return image number ``index`` of the scan, with its metadata; noise depends only on seed, shot and index."""
         return self.frame_of(self.light(shot, index), shot, index)
 
     def frame_of(self, light: ShotLight, shot: Shot, index: int) -> Frame:
@@ -301,28 +301,21 @@ class SensorSimulator:
             number = course.numbers[shot]
             pose = course.reported[number]
             covariance = None if course.covariance is None else course.covariance[number]
+        exposure_ms = self._choose_exposure(shot)
+        electrons = exposure_ms * self._compute_electrons_per_ms(*light, shot)
         return Frame(
-            self._render_image(light, shot, index),
+            self.detect(electrons, exposure_ms=exposure_ms, noise_seed=[self.options.seed, index]),
             stage_mm=shot.stage_mm,
             laser_on=shot.light == "laser",
-            exposure_ms=self._choose_exposure(shot),
+            exposure_ms=exposure_ms,
             time_s=self._find_time_s(shot, index),
             pose=pose,
             pose_covariance=covariance,
             speed_mm_per_s=self.scene.motion.stage_speed_mm_s(),
         )
 
-    def image(self, shot: Shot, index: int) -> np.ndarray:
-        """Return the grey values (H, W) of a shot; noise depends only on seed, position and index."""
-        return self._render_image(self.light(shot, index), shot, index)
-
-    def _render_image(self, light: ShotLight, shot: Shot, index: int) -> np.ndarray:
-        exposure_ms = self._choose_exposure(shot)
-        electrons = exposure_ms * self._compute_electrons_per_ms(*light, shot)
-        return self.detect(electrons, exposure_ms=exposure_ms, noise_seed=[self.options.seed, index])
-
     def expose(self, shot: Shot, index: int, *, exposure: float = 1.0, bright_share: float = 0.0) -> SimulatedImage:
-        """Return the image of a shot as `image` does, with its light; ``exposure`` multiplies the exposure time.
+        """Return the image of a shot as `frame` does, with its light; ``exposure`` multiplies the exposure time.
 
         An automatic exposure is shortened until at most ``bright_share`` (if not 0) of pixels exceed ``auto_level``.
         """

@@ -147,7 +147,7 @@ def test_the_light_of_all_ways_makes_the_image(thesis):
     sensor = small(thesis, lamp={"ambient_w_per_m2": 0.02}, detector={"bits": 12})
     studio = SensorSimulator(sensor, scene_of(plate(20.0)), Options(spp=8, effects=quiet))
     taken = studio.expose(SHOT, 0)
-    np.testing.assert_array_equal(taken.image, studio.image(SHOT, 0))
+    np.testing.assert_array_equal(taken.image, studio.frame(SHOT, 0).image)
     light = make_labels(studio, SHOT, taken, ("light",))["light_e"].astype(float)
     detector = sensor.detector
     dark = 1e-3 * taken.exposure_ms * detector.dark_current_e_per_s * detector.dark_current_growth()

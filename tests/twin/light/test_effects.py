@@ -47,7 +47,7 @@ def groove(**motion: float):
 
 def image(sensor: Sensor, effects: Effects) -> np.ndarray:
     studio = SensorSimulator(sensor, groove(), Options(spp=16, seed=3, effects=effects))
-    return studio.image(next(iter(studio.scene.motion.shots())), 0).astype(float)
+    return studio.frame(next(iter(studio.scene.motion.shots())), 0).image.astype(float)
 
 
 @pytest.mark.slow

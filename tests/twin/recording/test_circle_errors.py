@@ -138,11 +138,11 @@ def test_detection_errors_have_their_size_in_the_image(small, medium):
     """Through the window in water, too, where everything seems nearer."""
     scene = lamp_scene(medium, detection_std_px=0.6, errors_seed=3)
     studio, perfect = studio_of(small, scene), studio_of(small, lamp_scene(medium))
-    still = next(find_circles(perfect.image(LAMP, 0))).centres
+    still = next(find_circles(perfect.frame(LAMP, 0).image)).centres
     assert len(still) == ROWS * COLUMNS
     offsets = []
     for index in range(IMAGES):
-        circles = next(find_circles(studio.image(LAMP, index))).centres
+        circles = next(find_circles(studio.frame(LAMP, index).image)).centres
         distance = np.linalg.norm(still[:, None] - circles, axis=-1)
         offsets.append(circles[distance.argmin(axis=1)] - still)
     offsets = np.array(offsets)
@@ -161,7 +161,7 @@ def test_detection_errors_have_their_size_in_the_image(small, medium):
 def test_detection_errors_come_again_with_the_image(small):
     scene = lamp_scene(detection_std_px=0.6, errors_seed=3)
     studio = studio_of(small, scene)
-    images = [studio.image(LAMP, index) for index in (0, 1, 0)]
+    images = [studio.frame(LAMP, index).image for index in (0, 1, 0)]
     assert (images[0] != images[1]).any()
     np.testing.assert_array_equal(images[0], images[2])
     np.testing.assert_array_equal(studio_of(small, scene).image(LAMP, 1), images[1])

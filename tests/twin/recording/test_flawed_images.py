@@ -64,7 +64,7 @@ def apart(sensor: Sensor) -> SensorSimulator:
 
 
 def images(taken: SensorSimulator) -> list[np.ndarray]:
-    return [taken.image(shot, index).astype(float) for index, shot in enumerate(taken.scene.motion.shots())]
+    return [taken.frame(shot, index).image.astype(float) for index, shot in enumerate(taken.scene.motion.shots())]
 
 
 @pytest.fixture(scope="module")

@@ -241,7 +241,7 @@ def test_images_of_a_target_do_not_depend_on_earlier_ones():
     shots = list(scene.motion.shots())[:4]
     assert [shot.light for shot in shots] == ["lamp", "laser"] * 2
     used = SensorSimulator(sensor, scene, Options(spp=4))
-    images = [used.image(shot, number) for number, shot in enumerate(shots)]
+    images = [used.frame(shot, number).image for number, shot in enumerate(shots)]
     for number in (2, 3):
         fresh = SensorSimulator(sensor, scene, Options(spp=4))
-        np.testing.assert_array_equal(images[number], fresh.image(shots[number], number))
+        np.testing.assert_array_equal(images[number], fresh.frame(shots[number], number).image)
