@@ -92,6 +92,7 @@ def true_places(capture: Capture, hill: Hill) -> np.ndarray:
     return min(found, key=lambda there: np.abs(there - capture.stage_mm).max())
 
 
+@pytest.mark.slow
 def test_frames_are_where_the_stage_was_whatever_the_clocks_differ_by(hill, tmp_path, monkeypatch):
     usual, said = continuous._compare_clocks, []
 

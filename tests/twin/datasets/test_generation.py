@@ -65,6 +65,7 @@ def hashes(folder: Path) -> dict[str, str]:
     return {path.name: hash_file(path) for path in sorted(folder.glob("*.tar"))}
 
 
+@pytest.mark.slow
 def test_files_are_the_same_for_any_number_of_workers(folder, tmp_path):
     made = hashes(folder)
     assert len(made) >= 4
@@ -316,6 +317,7 @@ def test_presets_are_rendered(name, tmp_path):
         assert np.isfinite(samples[0]["target_px"]).all(axis=1).sum() > 50
 
 
+@pytest.mark.slow
 def test_runs_that_share_a_folder_make_the_same_files(folder, tmp_path):
     with ThreadPoolExecutor(2) as runs:
         made = [runs.submit(twin.dataset, small(), out=tmp_path / "shared", workers=2) for _ in range(2)]

@@ -131,6 +131,7 @@ def test_another_texture_and_translucency_compile_nothing(thesis, new_kernels):
     assert new == 0
 
 
+@pytest.mark.slow
 def test_scenes_of_a_data_set_share_their_kernels(thesis, new_kernels):
     table = load_description("stripe-clean").model_dump() | {"sensor": altered(thesis, SMALL), "spp": 4}
     described = DataSetDescription.model_validate(table)

@@ -87,6 +87,7 @@ def test_shifts_are_found_in_heights_with_gaps():
     np.testing.assert_allclose(found[0], [37.0, -52.0, 11.0], atol=4.0)
 
 
+@pytest.mark.slow
 def test_a_loop_is_closed(loop, closed):
     (cloud, reported, true), found = loop, closed
     assert found.crossings

@@ -319,6 +319,7 @@ def test_wrong_references_are_refused(ball, tmp_path):
         uwlts.compare_clouds(few, path)
 
 
+@pytest.mark.slow
 def test_the_command_writes_page_figures_and_cloud(ball, tmp_path, monkeypatch):
     path, cloud = ball
     cloud.save(tmp_path / "ball.ply")

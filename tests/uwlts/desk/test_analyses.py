@@ -127,6 +127,7 @@ def test_errors_are_said_in_words_and_leave_nothing(analyses, folder):
         analyses.start("inspect weld", {"cloud": "weld.ply"}, name="../away", overwrite=False)
 
 
+@pytest.mark.slow
 def test_clouds_are_compared_registered_and_exported(analyses, folder):
     step_cloud(HEIGHT_MM + 1.0, seed=1).save(folder / "later.ply")
     state = carried_out(analyses, "compare", {"cloud": "later.ply", "reference": "plate.ply"})

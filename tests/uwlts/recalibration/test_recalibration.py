@@ -390,6 +390,7 @@ def test_the_command_writes_a_calibration_only_without_doubts(tmp_path, monkeypa
     assert "2 poses are given for 3 passes" in uwlts(*command).stderr
 
 
+@pytest.mark.slow
 def test_the_desk_recalibrates_and_says_which_pass_comes_next(tmp_path):
     *_, problem = campaign(9, SHIFTED)
     for each in problem.passes:

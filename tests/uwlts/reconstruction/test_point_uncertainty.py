@@ -401,6 +401,7 @@ def test_figures_of_a_plane_are_those_of_a_new_evaluation():
     assert figures.gradients == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("body", ["pipe", "step"])
 def test_noise_of_a_size_is_that_of_monte_carlo_and_of_no_seed(body, monkeypatch):
     """A standard deviation of 400 draws is right to 3.5 %: 4 sigma. Another seed changes sizes by nothing."""

@@ -43,7 +43,7 @@ def test_damaged_meshes_are_refused(tmp_path: Path):
     (tmp_path / "a.obj").write_text("v 0 0 0\n")
     with pytest.raises(CaptureError, match=r"a\.obj"):
         load_triangles(tmp_path / "a.obj")
-    with pytest.raises(CaptureError, match="no file at"):
+    with pytest.raises(CaptureError, match="no mesh at"):
         load_triangles(tmp_path / "missing.stl")
 
 

@@ -159,6 +159,7 @@ def capture_path(thesis, tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_a_target_in_water_gives_the_mount(thesis, capture_path, tmp_path):
     mount = uwlts.calibrate_mount(capture_path, calibration=nominal(thesis, medium="water"))
     assert not [each.reason for each in mount.poses if each.reason] and isinstance(mount.artefact, BoardFound)
