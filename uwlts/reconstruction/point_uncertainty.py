@@ -49,7 +49,7 @@ _LEFT_OUT_MM = 1e-9
 """Largest sum of omitted last terms of tables."""
 _PULL = [2.0, 3.0], [0.12, 0.0]
 """Full widths at half maximum, px, and largest errors of simulated stripes in speckle relative to the noise."""
-_LARGEST_NOISE_PX = 0.2  # noise above which a centre does not tell its place in the pixel
+_LARGEST_NOISE_PX = 0.2  # noise above which a centre does not determine its place in the pixel
 _Arrays = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
