@@ -82,8 +82,8 @@ def open_regular(
     except ValueError as problem:
         raise error(f"{cannot}: no file can have this name") from problem
     if not stat.S_ISREG(found.st_mode):
-        is_folder = stat.S_ISDIR(found.st_mode)
-        raise error(f"{cannot}: it is {'a directory' if is_folder else 'not a regular file, but a pipe or device'}")
+        what = "a directory" if stat.S_ISDIR(found.st_mode) else "a pipe or device"
+        raise error(f"{cannot}: it is {what}, expected a regular file")
     if most_bytes is not None and found.st_size > most_bytes:
         sizes = f"{found.st_size / MiB:,.1f} MiB; this program reads up to {most_bytes / MiB:,.1f} MiB"
         raise error(f"the {called} {shorten(str(path))} has {sizes}")
