@@ -138,8 +138,12 @@ def _project(camera: CameraModel, points: np.ndarray) -> np.ndarray:
     return np.stack([camera.fx_px * x + camera.cx_px, camera.fy_px * y + camera.cy_px], axis=1)
 
 
-@lru_cache(maxsize=16)
 def _find_largest_square(d: Distortion) -> float:
+    return _find_edge_square(d.k1, d.k2, d.p1, d.p2, d.k3, d.k4, d.k5, d.k6)
+
+
+@lru_cache(maxsize=16)
+def _find_edge_square(k1: float, k2: float, p1: float, p2: float, k3: float, k4: float, k5: float, k6: float) -> float:
     """Return the squared radius of the domain where the distortion is one-to-one, or infinity if it is everywhere.
 
     The Jacobian of the distortion is symmetric. If it is positive definite on a disc, no two points of the disc have
@@ -151,9 +155,8 @@ def _find_largest_square(d: Distortion) -> float:
     infinite.
     """
     r = Polynomial([0.0, 1.0])
-    tangential = 6.0 * math.hypot(d.p1, d.p2) * r
-    factors = (d.k1, d.k2, d.k3), (d.k4, d.k5, d.k6)
-    above, below = (Polynomial([1.0, 0.0, a, 0.0, b, 0.0, c]) for a, b, c in factors)
+    tangential = 6.0 * math.hypot(p1, p2) * r
+    above, below = (Polynomial([1.0, 0.0, a, 0.0, b, 0.0, c]) for a, b, c in ((k1, k2, k3), (k4, k5, k6)))
     across = above - tangential * below
     along = (above + r * above.deriv()) * below - r * above * below.deriv() - tangential * below**2
     roots = np.concatenate([np.roots(each.coef) for each in (across, along, below)])

@@ -238,7 +238,9 @@ def _read_estimate(
         media.append(unused_name("the scan", media))
         keys.append(MediumIndex(media[-1]))
         values = np.append(values, calibration.medium_index(medium))
-        covariance = block_diag(covariance, medium.index_uncertainty(calibration.wavelength_nm, uncertainty) ** 2)
+        covariance = np.asarray(
+            block_diag(covariance, medium.index_uncertainty(calibration.wavelength_nm, uncertainty) ** 2)
+        )
     lens = len(intrinsics.names)
     if tuple(keys[:lens]) != intrinsics.keys:
         raise _make_damage_error("its parameters are inconsistent with the camera")
