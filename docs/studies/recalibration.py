@@ -305,7 +305,7 @@ def check(seed: int, folder: Path, calibration: uwlts.Calibration, fault: str) -
             CaptureWriter(mirrored, plain.header, dtype=np.dtype(np.uint8)) as writer,
         ):
             for frame in map(plain.__getitem__, range(len(plain))):
-                writer.append(replace(frame, seen=np.ascontiguousarray(frame.image[:, ::-1])))
+                writer.append(replace(frame, image=np.ascontiguousarray(frame.image[:, ::-1])))
         captures[1] = mirrored
     try:
         found = uwlts.recalibrate(

@@ -66,7 +66,7 @@ def scan_images() -> list[np.ndarray]:
 def images(change: Callable[[np.ndarray], np.ndarray], *, laser: bool | None = None) -> Damage:
     """Changes all images, or those with the laser on or off."""
     return lambda frames: [
-        replace(f, seen=np.ascontiguousarray(change(f.image))) if laser in (None, f.laser_on) else f for f in frames
+        replace(f, image=np.ascontiguousarray(change(f.image))) if laser in (None, f.laser_on) else f for f in frames
     ]
 
 

@@ -386,9 +386,7 @@ def serve_ros(
         Calibration of the sensor.
     folder : str or Path
         Folder of the captures, which are numbered.
-    camera : str, optional
-        As for `uwlts.scan`.
-    stage : str, optional
+    camera, stage : str, optional
         As for `uwlts.scan`.
     home : bool
         Home the stage first, before each scan for which it is locked.

@@ -131,19 +131,17 @@ def _project(camera: CameraModel, points: np.ndarray) -> np.ndarray:
     z = np.where(points[:, 2] > 0, points[:, 2], np.nan)
     x, y = points[:, 0] / z, points[:, 1] / z
     if camera.coefficients().any():
-        outside = x * x + y * y >= _find_largest_square(camera.distortion)
+        outside = x * x + y * y >= _find_edge_square(**camera.distortion.model_dump())
         x, y = _distort(camera.distortion, x, y)
         x[outside] = np.nan
         y[outside] = np.nan
     return np.stack([camera.fx_px * x + camera.cx_px, camera.fy_px * y + camera.cy_px], axis=1)
 
 
-def _find_largest_square(d: Distortion) -> float:
-    return _find_edge_square(d.k1, d.k2, d.p1, d.p2, d.k3, d.k4, d.k5, d.k6)
-
-
 @lru_cache(maxsize=16)
-def _find_edge_square(k1: float, k2: float, p1: float, p2: float, k3: float, k4: float, k5: float, k6: float) -> float:
+def _find_edge_square(
+    *, k1: float, k2: float, p1: float, p2: float, k3: float, k4: float, k5: float, k6: float
+) -> float:
     """Return the squared radius of the domain where the distortion is one-to-one, or infinity if it is everywhere.
 
     The Jacobian of the distortion is symmetric. If it is positive definite on a disc, no two points of the disc have
@@ -252,7 +250,7 @@ def _undistort(d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray) -> tuple[n
             if found.all():
                 break
             x, y = x + x_step, y + y_step
-        found &= x * x + y * y < _find_largest_square(d)
+        found &= x * x + y * y < _find_edge_square(**d.model_dump())
     if not found.all():
         hard = np.flatnonzero(~found)
         x[hard], y[hard] = _undistort_damped(d, x_seen[hard], y_seen[hard])
@@ -265,7 +263,7 @@ def _undistort_damped(d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray) -> 
     A step is halved until it stays in the domain and reduces the residual. Because the Jacobian is positive definite in
     the domain, a short enough step always reduces it.
     """
-    largest, allowed = _find_largest_square(d), _is_allowed(x_seen, y_seen)
+    largest, allowed = _find_edge_square(**d.model_dump()), _is_allowed(x_seen, y_seen)
     x, y = np.zeros_like(x_seen), np.zeros_like(y_seen)
     x_next, y_next, missing = x, y, np.full_like(x, np.inf)
     for _ in range(_MOST_STEPS):

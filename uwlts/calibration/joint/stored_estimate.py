@@ -238,9 +238,8 @@ def _read_estimate(
         media.append(unused_name("the scan", media))
         keys.append(MediumIndex(media[-1]))
         values = np.append(values, calibration.medium_index(medium))
-        covariance = np.asarray(
-            block_diag(covariance, medium.index_uncertainty(calibration.wavelength_nm, uncertainty) ** 2)
-        )
+        std = medium.index_uncertainty(calibration.wavelength_nm, uncertainty)
+        covariance = np.asarray(block_diag(covariance, std**2))
     lens = len(intrinsics.names)
     if tuple(keys[:lens]) != intrinsics.keys:
         raise _make_damage_error("its parameters are inconsistent with the camera")
