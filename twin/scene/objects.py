@@ -236,13 +236,9 @@ def _triangulate(thing: AnyObject) -> tuple[np.ndarray, ...] | None:
         case Block() if thing.edge_radius_mm > 0:
             return rounded_box(np.array(thing.size_mm), radius_mm=thing.edge_radius_mm)
         case Block() | Ball() if rough:
-            import trimesh
+            from trimesh.creation import box, icosphere
 
-            match thing:
-                case Ball():
-                    solid = trimesh.creation.icosphere(subdivisions=5, radius=thing.diameter_mm / 2)
-                case Block():
-                    solid = trimesh.creation.box(thing.size_mm)
+            solid = icosphere(5, thing.diameter_mm / 2) if isinstance(thing, Ball) else box(thing.size_mm)
             return solid.vertices, solid.faces
         case Pipe() if rough:
             around = np.linspace(0, 2 * np.pi, 360, endpoint=False)

@@ -4,7 +4,9 @@ Pinhole camera with OpenCV's Brown-Conrady or rational distortion. Pixel (0, 0) 
 """
 
 import math
+from collections.abc import Hashable
 from functools import lru_cache
+from typing import cast
 
 import numpy as np
 from numpy.polynomial import Polynomial
@@ -131,7 +133,7 @@ def _project(camera: CameraModel, points: np.ndarray) -> np.ndarray:
     z = np.where(points[:, 2] > 0, points[:, 2], np.nan)
     x, y = points[:, 0] / z, points[:, 1] / z
     if camera.coefficients().any():
-        outside = x * x + y * y >= _find_edge_square(**camera.distortion.model_dump())
+        outside = x * x + y * y >= _find_largest_square(cast(Hashable, camera.distortion))
         x, y = _distort(camera.distortion, x, y)
         x[outside] = np.nan
         y[outside] = np.nan
@@ -139,9 +141,7 @@ def _project(camera: CameraModel, points: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=16)
-def _find_edge_square(
-    *, k1: float, k2: float, p1: float, p2: float, k3: float, k4: float, k5: float, k6: float
-) -> float:
+def _find_largest_square(d: Distortion) -> float:
     """Return the squared radius of the domain where the distortion is one-to-one, or infinity if it is everywhere.
 
     The Jacobian of the distortion is symmetric. If it is positive definite on a disc, no two points of the disc have
@@ -153,8 +153,8 @@ def _find_edge_square(
     infinite.
     """
     r = Polynomial([0.0, 1.0])
-    tangential = 6.0 * math.hypot(p1, p2) * r
-    above, below = (Polynomial([1.0, 0.0, a, 0.0, b, 0.0, c]) for a, b, c in ((k1, k2, k3), (k4, k5, k6)))
+    tangential = 6.0 * math.hypot(d.p1, d.p2) * r
+    above, below = (Polynomial([1.0, 0.0, a, 0.0, b, 0.0, c]) for a, b, c in ((d.k1, d.k2, d.k3), (d.k4, d.k5, d.k6)))
     across = above - tangential * below
     along = (above + r * above.deriv()) * below - r * above * below.deriv() - tangential * below**2
     roots = np.concatenate([np.roots(each.coef) for each in (across, along, below)])
@@ -250,7 +250,7 @@ def _undistort(d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray) -> tuple[n
             if found.all():
                 break
             x, y = x + x_step, y + y_step
-        found &= x * x + y * y < _find_edge_square(**d.model_dump())
+        found &= x * x + y * y < _find_largest_square(cast(Hashable, d))
     if not found.all():
         hard = np.flatnonzero(~found)
         x[hard], y[hard] = _undistort_damped(d, x_seen[hard], y_seen[hard])
@@ -263,7 +263,7 @@ def _undistort_damped(d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray) -> 
     A step is halved until it stays in the domain and reduces the residual. Because the Jacobian is positive definite in
     the domain, a short enough step always reduces it.
     """
-    largest, allowed = _find_edge_square(**d.model_dump()), _is_allowed(x_seen, y_seen)
+    largest, allowed = _find_largest_square(cast(Hashable, d)), _is_allowed(x_seen, y_seen)
     x, y = np.zeros_like(x_seen), np.zeros_like(y_seen)
     x_next, y_next, missing = x, y, np.full_like(x, np.inf)
     for _ in range(_MOST_STEPS):
