@@ -164,8 +164,8 @@ def test_detection_errors_come_again_with_the_image(small):
     images = [studio.frame(LAMP, index).image for index in (0, 1, 0)]
     assert (images[0] != images[1]).any()
     np.testing.assert_array_equal(images[0], images[2])
-    np.testing.assert_array_equal(studio_of(small, scene).image(LAMP, 1), images[1])
-    other = studio_of(small, lamp_scene(detection_std_px=0.6, errors_seed=4)).image(LAMP, 1)
+    np.testing.assert_array_equal(studio_of(small, scene).frame(LAMP, 1).image, images[1])
+    other = studio_of(small, lamp_scene(detection_std_px=0.6, errors_seed=4)).frame(LAMP, 1).image
     assert (other != images[1]).any()
 
 
@@ -174,7 +174,7 @@ def test_detection_errors_come_on_top_of_printed_ones(small):
     for printed in (0.0, 0.3):
         scene = lamp_scene(detection_std_px=0.6, errors_seed=5, centre_std_mm=printed)
         expected = expected_px(with_window(small, mounted=False), lattice_mm(scene))
-        positions.append(found_px(studio_of(small, scene).image(LAMP, 2), expected))
+        positions.append(found_px(studio_of(small, scene).frame(LAMP, 2).image, expected))
     shifts = draw_print_errors(scene.objects[0])
     moved = positions[1] - positions[0]
     points = lattice_mm(scene)
