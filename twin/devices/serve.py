@@ -173,8 +173,8 @@ class Bench:
     def prepare(self, exposure_ms: float) -> None:
         """Compile the kernels for laser images with a trial image, because the compilation exceeds an exposure."""
         state = replace(self._state(), laser_on=True, power=1.0)
-        light = self._render_electrons_per_ms(state, None)
-        self._simulator.detect(exposure_ms * light, exposure_ms=exposure_ms, noise_seed=[self._simulator.options.seed])
+        light, noise_seed = self._render_electrons_per_ms(state, None), [self._simulator.options.seed]
+        self._simulator.formation.detect(exposure_ms * light, exposure_ms=exposure_ms, noise_seed=noise_seed)
         self._travelled_mm, self.renderings = math.nan, 0
 
     def frame(self, exposure_ms: float, state: StageState | None = None) -> np.ndarray:
@@ -192,7 +192,7 @@ class Bench:
             self._seen.clear()
         noise_seed = [self._simulator.options.seed, _NOISE, self.frames]
         self.frames += 1
-        return self._simulator.detect(light, exposure_ms=exposure_ms, noise_seed=noise_seed)
+        return self._simulator.formation.detect(light, exposure_ms=exposure_ms, noise_seed=noise_seed)
 
     def _render_electrons_per_ms(self, state: StageState, travel: "Travel | None") -> np.ndarray:
         """Return mean photo-electrons per ms (H, W), without noise; those of the latest position are kept."""

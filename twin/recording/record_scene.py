@@ -13,7 +13,8 @@ import numpy as np
 
 from twin.backend.llvm import preserve_threads
 from twin.recording.frame_truth import FrameTruth, find_visible_surfaces
-from twin.recording.sensor_simulator import SensorSimulator, ShotLight, with_window
+from twin.recording.image_formation import ShotLight
+from twin.recording.sensor_simulator import SensorSimulator, with_window
 from twin.rendering_options import Options
 from twin.scene.description import Scene, medium_of
 from twin.scene.platforms import Platform, Shot

@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass
 from itertools import product
-from typing import Literal, TypeAlias
+from typing import Literal
 
 import numpy as np
 
 from twin.light.illumination import reflect_ring
 from twin.light.pose import Travel
-from twin.light.renderer import LaserFrame, Renderer
+from twin.light.renderer import Renderer
 from twin.recording.frame_truth import (
     Crossings,
     FrameTruth,
@@ -17,30 +17,17 @@ from twin.recording.frame_truth import (
     measure_line_light,
     select_brightest,
 )
+from twin.recording.image_formation import ImageFormation, ShotLight
 from twin.rendering_options import Options
 from twin.scene.description import PrintedPlate, Scene, medium_of, replace_values
 from twin.scene.finish import shift_points
 from twin.scene.platforms import Light, Platform, Shot
-from twin.sensor.detector import (
-    add_ghost,
-    add_glare,
-    as_built,
-    deliver_image,
-    dirt,
-    electrons_per_ms,
-    fixed_pattern,
-    grey_values,
-    laser_shares,
-    vignette,
-)
-from twin.sensor.speckle import Speckle, coherence
+from twin.sensor.detector import as_built
 from uwlts.errors import DesignError
 from uwlts.model.placement import apparent_depth_mm, camera_from_object
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Frame
 
-ShotLight: TypeAlias = tuple[np.ndarray, LaserFrame | None]
-"""Irradiance (H, W) of lamp and daylight before the lens in W/mm2, and the laser's light, None if it is off."""
 PROBE_SPP = 4
 """Samples per lit pixel of the images that determine the exposure, where an error of some percent is acceptable."""
 BRIGHT_SHARE = 0.98
@@ -126,21 +113,11 @@ class SensorSimulator:
             self.sensor, self.medium, scene, effects=options.effects, flaws=flaws, seed=options.seed
         )
         check_scene(self.renderer, scene)
-        camera, laser = self.sensor.camera, self.sensor.laser
-        self._speckle = Speckle(camera, wavelength_nm=laser.wavelength_nm, seed=options.seed)
-        # None without losses: each multiplication of an image takes a millisecond.
-        self._passed = vignette(camera, flaws.vignetting) if flaws.vignetting else None
-        if flaws.dirt and mounted:
-            clean = dirt(camera, flaws.dirt, seed=options.seed)
-            self._passed = clean if self._passed is None else self._passed * clean
+        self.formation = ImageFormation(self.sensor, self.medium, options, window_mounted=mounted)
         self._lamp_ring = None
         if flaws.lamp_reflection and mounted:
             self._lamp_ring = reflect_ring(self.renderer.view, self.sensor, reflectance=flaws.lamp_reflection)
-        self._laser_shares = laser_shares(camera.height_px, camera.width_px) if flaws.colour_filter else None
         self._crossings: tuple[Shot, Crossings] | None = None
-        self._pattern = None
-        if options.effects.fixed_pattern:
-            self._pattern = fixed_pattern(self.sensor.detector, height=camera.height_px, width=camera.width_px)
         self._level_e = self.sensor.exposure.auto_level * self.sensor.detector.full_well_e
         self.exposure_ms = {light: self._find_exposure(light, probe) for light in dict.fromkeys(scene.motion.lights)}
         longest_ms = max(self.exposure_ms[shot.light] * shot.exposure for shot in scene.motion.shots())
@@ -200,7 +177,8 @@ class SensorSimulator:
 
     def electrons_per_ms(self, shot: Shot, *, spp: int, seed: int, travel: Travel | None = None) -> np.ndarray:
         """Return the mean photo-electrons per ms (H, W) of a shot."""
-        return self._compute_electrons_per_ms(*self._render_light(shot, spp=spp, seed=seed, travel=travel), shot)
+        light = self._render_light(shot, spp=spp, seed=seed, travel=travel)
+        return self.formation.electrons_per_ms(light, shot)
 
     def _render_light(
         self,
@@ -226,45 +204,9 @@ class SensorSimulator:
         )
         return even, laser
 
-    def _compute_electrons_per_ms(
-        self, even: np.ndarray, laser: LaserFrame | None, shot: Shot, *, speckle: bool = True
-    ) -> np.ndarray:
-        """Return mean photo-electrons per ms (H, W) of light from `_render_light`, with speckle if it is enabled."""
-        light = self._apply_lens(even)
-        if laser is not None:
-            seen = self._apply_lens(self._add_speckle(laser, shot) if speckle else laser.irradiance())
-            light = light + (seen if self._laser_shares is None else self._laser_shares * seen)
-        return self._convert_to_electrons(light)
-
-    def _convert_to_electrons(self, irradiance: np.ndarray) -> np.ndarray:
-        sensor = self.sensor
-        return electrons_per_ms(irradiance, sensor.camera, sensor.detector, wavelength_nm=sensor.laser.wavelength_nm)
-
     def shows(self, shot: Shot, light: Light) -> bool:
         """Return whether the laser or the lamp is on in a shot."""
         return shot.light == light or (self.options.flaws.lamp_and_laser and shot.light != "day")
-
-    def _apply_lens(self, irradiance: np.ndarray) -> np.ndarray:
-        """Return the irradiance (H, W) behind the lens, with vignetting, ghost and glare."""
-        passed, flaws = irradiance if self._passed is None else irradiance * self._passed, self.options.flaws
-        passed = add_ghost(passed, self.sensor.camera, flaws.ghost) if flaws.ghost else passed
-        return add_glare(passed, flaws.glare) if flaws.glare else passed
-
-    def _add_speckle(self, frame: LaserFrame, shot: Shot) -> np.ndarray:
-        """Return the irradiance (H, W) of the laser in W/mm2, with speckle."""
-        if not self.options.effects.speckle:
-            return frame.irradiance()
-        laser = self.sensor.laser
-        contrast = coherence(
-            frame.roughness_um,
-            linewidth_nm=laser.linewidth_nm,
-            wavelength_nm=laser.wavelength_nm,
-            index=self.medium.refractive_index(laser.wavelength_nm),
-        )
-        factors = self._speckle.factors(
-            frame.rows, frame.columns, travel_mm=shot.travelled_mm, polarisation=frame.polarisation, coherence=contrast
-        )
-        return frame.irradiance(factors)
 
     def light(self, shot: Shot, index: int) -> ShotLight:
         """Return the light of image number ``index`` before the lens."""
@@ -302,9 +244,9 @@ class SensorSimulator:
             pose = course.reported[number]
             covariance = None if course.covariance is None else course.covariance[number]
         exposure_ms = self._choose_exposure(shot)
-        electrons = exposure_ms * self._compute_electrons_per_ms(*light, shot)
+        electrons = exposure_ms * self.formation.electrons_per_ms(light, shot)
         return Frame(
-            self.detect(electrons, exposure_ms=exposure_ms, noise_seed=[self.options.seed, index]),
+            self.formation.detect(electrons, exposure_ms=exposure_ms, noise_seed=[self.options.seed, index]),
             stage_mm=shot.stage_mm,
             laser_on=shot.light == "laser",
             exposure_ms=exposure_ms,
@@ -319,38 +261,26 @@ class SensorSimulator:
 
         An automatic exposure is shortened until at most ``bright_share`` (if not 0) of pixels exceed ``auto_level``.
         """
-        even, laser = self.light(shot, index)
-        per_ms, exposure_ms = self._compute_electrons_per_ms(even, laser, shot), exposure * self._choose_exposure(shot)
+        even, laser = light = self.light(shot, index)
+        per_ms, exposure_ms = self.formation.electrons_per_ms(light, shot), exposure * self._choose_exposure(shot)
         if bright_share > 0 and self.sensor.exposure.described_ms(shot.light) == "auto":
             exposure_ms = min(exposure_ms, self._level_e / max(float(np.quantile(per_ms, 1 - bright_share)), 1e-9))
         nothing = np.zeros_like(even)
 
-        def to_electrons(light: np.ndarray, shares: np.ndarray | None = None) -> np.ndarray:
-            if not light.any():
+        def to_electrons(part: np.ndarray, *, of_laser: bool) -> np.ndarray:
+            if not part.any():
                 return nothing
-            passed = self._apply_lens(light)
-            mean = exposure_ms * self._convert_to_electrons(passed if shares is None else shares * passed)
+            mean = exposure_ms * self.formation.electrons_of_part(part, of_laser=of_laser)
             return np.maximum(mean, 0, dtype=np.float32)
 
         parts = [nothing] * 4
         if laser is not None:
-            parts = [laser.direct(), laser.haze, laser.scattered - laser.haze, laser.particles]
-        parts = [*(to_electrons(part, self._laser_shares) for part in parts), to_electrons(even)]
-        image = self.detect(exposure_ms * per_ms, exposure_ms=exposure_ms, noise_seed=[self.options.seed, index])
+            paths = laser.direct(), laser.haze, laser.scattered - laser.haze, laser.particles
+            parts = [to_electrons(path, of_laser=True) for path in paths]
+        parts.append(to_electrons(even, of_laser=False))
+        noise_seed = [self.options.seed, index]
+        image = self.formation.detect(exposure_ms * per_ms, exposure_ms=exposure_ms, noise_seed=noise_seed)
         return SimulatedImage(image, exposure_ms, *parts)
-
-    def detect(self, electrons: np.ndarray, *, exposure_ms: float, noise_seed: list[int]) -> np.ndarray:
-        """Return grey values (H, W) for mean photo-electrons (H, W), with seeded noise if noise is enabled."""
-        rng = np.random.default_rng(noise_seed) if self.options.effects.noise else None
-        image = grey_values(
-            electrons,
-            self.sensor.detector,
-            exposure_ms=exposure_ms,
-            rng=rng,
-            pattern=self._pattern,
-            row_noise_e=self.options.flaws.row_noise,
-        )
-        return deliver_image(image, self.options.flaws)
 
     def truth(self, shot: Shot) -> FrameTruth:
         """Return the ground truth of every profile line of a shot."""
@@ -397,9 +327,9 @@ class SensorSimulator:
         for shot in dict.fromkeys((shots[len(shots) // 2], shots[0], shots[-1])):
             if probe == "middle" and brightest > 0:
                 break
-            even, laser = self._render_light(shot, spp=PROBE_SPP, seed=0, travel=None)
+            light = self._render_light(shot, spp=PROBE_SPP, seed=0, travel=None)
             # If one shot suffices, skip its speckle, which would double the time.
-            peaks = self._compute_electrons_per_ms(even, laser, shot, speckle=probe == "scan").max(axis=axis)
+            peaks = self.formation.electrons_per_ms(light, shot, speckle=probe == "scan").max(axis=axis)
             reference = np.sort(peaks)[-1 - min(STRAY_LINES, len(peaks) - 1)]
             lit = peaks[peaks > LIT_SHARE * reference]
             brightest = max(brightest, float(np.quantile(lit, BRIGHT_SHARE)) if len(lit) else 0.0)

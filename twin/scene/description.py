@@ -18,11 +18,14 @@ from twin.scene.platform_kinds import Robot, RotaryTable, Vehicle
 from twin.scene.platforms import IdealPath, Motion, Platform
 from twin.scene.scene_object import FlatObject, Pose, Reflectance, SceneObject
 from uwlts.errors import DescriptionError
-from uwlts.model.library import find_description, read_table, validate_description
+from uwlts.model.library import find_description, load_sensor, read_table, validate_description
 from uwlts.model.sensor import Description, Medium, NotNegative, Positive, Sensor, Table, Vector
 from uwlts.targets import CircleTarget, Target, parse_target
 
 Kind = TypeVar("Kind", bound=Description)
+
+NamedSensor = Annotated[Sensor, BeforeValidator(lambda given: load_sensor(given) if isinstance(given, str) else given)]
+"""Sensor of a description, which may also give its name or path."""
 
 
 def replace_values(described: Kind, **changes: object) -> Kind:
@@ -173,10 +176,6 @@ class CirclePlate(PrintedPlate):
         return self.circle_reflectance, self.marker_reflectance
 
 
-def _parse_target(target: Target | Mapping[str, object]) -> Target:
-    return target if isinstance(target, Target) else parse_target(target)
-
-
 class TargetPlate(PrintedPlate):
     """A calibration target of any kind.
 
@@ -186,7 +185,10 @@ class TargetPlate(PrintedPlate):
     """
 
     kind: Literal["target_plate"]
-    target: Annotated[SerializeAsAny[Target], BeforeValidator(_parse_target)]
+    target: Annotated[
+        SerializeAsAny[Target],
+        BeforeValidator(lambda given: given if isinstance(given, Target) else parse_target(given)),
+    ]
     ink_reflectance: Reflectance = 0.05
     rim_mm: NotNegative = 10.0
 
@@ -209,17 +211,15 @@ AnyObject = Annotated[
 ]
 
 
-def _read_kind_of_motion(motion: object) -> str:
-    return str(motion.get("kind", "") if isinstance(motion, Mapping) else getattr(motion, "kind", ""))
-
-
 AnyMotion = Annotated[
     Annotated[Motion, Tag("")]
     | Annotated[IdealPath, Tag("path")]
     | Annotated[RotaryTable, Tag("rotary_table")]
     | Annotated[Robot, Tag("robot")]
     | Annotated[Vehicle, Tag("vehicle")],
-    Discriminator(_read_kind_of_motion),
+    Discriminator(
+        lambda given: str(given.get("kind", "") if isinstance(given, Mapping) else getattr(given, "kind", ""))
+    ),
 ]
 """The steps of a stage, or a platform selected by ``kind``."""
 
