@@ -347,6 +347,7 @@ def test_a_target_held_by_hand_is_led_to_a_calibration(served, folder, tmp_path)
     finally:
         served.camera.connect()
     assert "too similar to image 1" in text and "next: tilt the target" in text
+    assert "wrote c.json" in text, text
     calibration = load_calibration(tmp_path / "c.json")
     assert calibration.residuals["camera"]["std"]["f"] < 0.5
     assert calibration.residuals["camera"]["rms_px"] < 0.15
