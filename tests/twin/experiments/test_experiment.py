@@ -301,7 +301,7 @@ def test_a_failed_calibration_is_reported_with_its_reason(
     """The recordings are missing, as if another program had removed them."""
     described, out = tmp_path / "small.toml", tmp_path / "out"
     described.write_text(CAMPAIGN + TARGET + SPHERES, encoding="utf-8")
-    out.mkdir()
+    (out / "campaign-0").mkdir(parents=True)
     monkeypatch.setattr("twin.experiments.experiment.record_campaigns", lambda *_, **__: [out / "campaign-0"])
     with pytest.raises(CommandFailed):
         twin.predict(campaign=described, out=out, campaigns=1)
