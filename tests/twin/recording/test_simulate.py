@@ -238,7 +238,7 @@ def test_the_package_offers_its_functions_without_importing_the_renderer():
 
 
 def test_images_of_a_target_do_not_depend_on_earlier_ones():
-    coarse = {"camera": {"width_px": 160, "height_px": 128, "pixel_size_um": 42.4}}
+    coarse = {"camera": {"width_px": 160, "height_px": 128, "pixel_size_um": 21.2}}
     sensor, scene = altered(load_sensor("thesis-small"), coarse), load_scene("target-through-window")
     shots = list(scene.motion.shots())[:4]
     assert [shot.light for shot in shots] == ["lamp", "laser"] * 2
