@@ -247,4 +247,4 @@ def test_images_of_a_target_do_not_depend_on_earlier_ones():
     for number in (2, 3):
         fresh = SensorSimulator(sensor, scene, Options(spp=4))
         np.testing.assert_array_equal(images[number], fresh.frame(shots[number], number).image)
-        assert images[number].max() > 100
+        assert np.ptp(images[number]) > 50
