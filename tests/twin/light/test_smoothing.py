@@ -112,7 +112,7 @@ def test_small_places_take_the_light_of_the_cells_about_them():
 # --- rendered frames --------------------------------------------------------------------------------------------------
 
 PEAK_DN = 200.0
-FRAMES = 8
+FRAMES = 16
 GOALS = {"coastal": (0.3, 1.0), "harbour": (1.0, 3.0)}
 """99.9th percentile and largest error in grey levels of frames with the default samples."""
 FALSE_ALARM = 1e-5
