@@ -177,22 +177,6 @@ def test_steps_near_and_far_bring_lengths_back(earlier, thesis):
     assert length_error(result.calibration) < 0.75 * length_error(earlier)
 
 
-@pytest.mark.slow
-def test_stated_uncertainties_of_the_index_hold(thesis):
-    """Pulls of independent calibrations and steps: the mean square of 5 is within 0.04 and 4.1 (chi2, 99.8 %)."""
-    pulls = []
-    for seed in range(5):
-        result = refreshed(
-            calibrated(thesis, seed=seed, columns=9),
-            steps(thesis, depths_mm=(15.0, 80.0), seed=seed),
-            index_std=POORLY_KNOWN,
-        )
-        index, std = index_in(result.calibration)
-        pulls.append((index - INDEX) / std)
-    # The prior holds the index 6e-4 too low and has its share, a fifth of that, of the square.
-    assert 0.04 < np.mean(np.square(pulls)) < 4.5
-
-
 def test_a_prior_with_correlations_counts_as_its_covariance():
     """Residuals, their derivatives by differences, and the chi-square; from degrees of 1e-8 to 1e3."""
     rng = np.random.default_rng(0)
