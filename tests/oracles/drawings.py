@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
+from scipy.spatial import KDTree
 
 Rays = Callable[[np.ndarray], np.ndarray]
 """Directions (N, 3) in the camera frame of pixels (N, 2)."""
@@ -61,11 +62,12 @@ def circles(centres_mm: np.ndarray, diameter_mm: float, *, bright: bool = False,
     """Return equal circles on a plate that ends ``edge_mm`` beyond their centres."""
     low, high = centres_mm.min(axis=0) - edge_mm, centres_mm.max(axis=0) + edge_mm
     circle, plate = (0.85, 0.08) if bright else (0.08, 0.85)
+    centres = KDTree(centres_mm)
 
     def levels(places: np.ndarray) -> np.ndarray:
         on_plate = ((places >= low) & (places <= high)).all(axis=1)
-        near, inside = places[on_plate], np.zeros(len(places), bool)
-        inside[on_plate] = np.any([np.hypot(*(near - centre).T) <= diameter_mm / 2 for centre in centres_mm], axis=0)
+        inside = np.zeros(len(places), bool)
+        inside[on_plate] = np.isfinite(centres.query(places[on_plate], distance_upper_bound=diameter_mm / 2)[0])
         return np.where(inside, circle, np.where(on_plate, plate, 0.3))
 
     return levels
