@@ -216,7 +216,7 @@ def test_an_unusually_thick_wall_is_noted():
 
 
 def test_pits_are_found_and_measured():
-    """Pits, one next to a much larger one, and a protrusion, on an oval pipe seen over an eighth of its circumference."""
+    """Pits, one next to a much larger one, and a protrusion, on an eighth of the circumference of an oval pipe."""
     places = {(-10.0, -40.0): (3.0, 0.3), (0.0, 5.0): (18.0, 3.0), (8.0, -20.0): (8.0, 0.8), (-9.0, 40.0): (6.0, -0.5)}
     places[(-12.0, 9.0)] = (4.0, 0.4)
 
