@@ -78,7 +78,7 @@ def test_fields_are_parameters_of_the_public_functions():
 
 
 def test_nothing_is_replaced_without_being_asked(analyses, folder):
-    """What is asked is in tests/system/test_desk_analyses.py, with the findings of a weld and an export."""
+    """The page itself, with findings of a weld and an export, is tested in tests/system/test_desk_analyses.py."""
     (folder / "mine.html").write_text("mine", encoding="utf-8")
     with pytest.raises(OutputError, match=r"mine.html exists: .* tick 'replace existing'"):
         analyses.start("inspect weld", {"cloud": "weld.ply"}, name="mine", overwrite=False)
