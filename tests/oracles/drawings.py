@@ -3,7 +3,6 @@
 from collections.abc import Callable
 
 import numpy as np
-from scipy.spatial import KDTree
 
 Rays = Callable[[np.ndarray], np.ndarray]
 """Directions (N, 3) in the camera frame of pixels (N, 2)."""
@@ -62,12 +61,12 @@ def circles(centres_mm: np.ndarray, diameter_mm: float, *, bright: bool = False,
     """Return equal circles on a plate that ends ``edge_mm`` beyond their centres."""
     low, high = centres_mm.min(axis=0) - edge_mm, centres_mm.max(axis=0) + edge_mm
     circle, plate = (0.85, 0.08) if bright else (0.08, 0.85)
-    centres = KDTree(centres_mm)
 
     def levels(places: np.ndarray) -> np.ndarray:
         on_plate = ((places >= low) & (places <= high)).all(axis=1)
         inside = np.zeros(len(places), bool)
-        inside[on_plate] = np.isfinite(centres.query(places[on_plate], distance_upper_bound=diameter_mm / 2)[0])
+        x, y = places[on_plate].T
+        inside[on_plate] = np.any([(x - u) ** 2 + (y - v) ** 2 <= diameter_mm**2 / 4 for u, v in centres_mm], axis=0)
         return np.where(inside, circle, np.where(on_plate, plate, 0.3))
 
     return levels
