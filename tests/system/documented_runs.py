@@ -123,7 +123,7 @@ class Runner:
     """Runs command lines and Python in a folder; `small` holds the smaller descriptions.
 
     The project's own commands run in this process, unless `separate`: signals and terminals are as for a user then.
-    Those of the shared campaign are not run again.
+    Commands of the shared campaign are not run again.
     """
 
     def __init__(self, folder: Path, small: Path, *, shared: Campaign | None = None, separate: bool = False) -> None:
