@@ -45,7 +45,7 @@ SENSOR = replace_values(
 )
 WATER = SENSOR.media["water"]
 MOTION = MotionUncertainty(pose_mm=0.01, pose_rad=np.radians(0.005), pose_scale=5e-5, image_mm=0.003)
-TRAVEL = np.linspace(-45.0, 45.0, 46)
+TRAVEL = np.linspace(-45.0, 45.0, 31)
 NOISE_PX = 0.1
 SHIFTED = {"first": (0.0, 0.0, 0.0), "shifted": (40.0, 0.0, 0.0), "lower": (0.0, 60.0, 0.0)}
 TURNED = {"0": (0.0, 0.0, 0.0), "90": (0.0, 0.0, 90.0), "180": (0.0, 0.0, 180.0), "lower": (0.0, 60.0, 0.0)}
@@ -258,15 +258,14 @@ def photograph(built, water, earlier, seed):
 def test_photographs_of_a_target_and_passes_give_the_same_in_either_order(monkeypatch):
     """Each estimate is the prior knowledge of the next, with its covariance: to first order, it is one of all.
 
-    With all points, both agree to 0.07 standard uncertainties, and these to 0.3 % (seeds 12 and 14).
+    With 46 images in a pass, both agree to 0.07 standard uncertainties (seeds 12 and 14).
     """
     monkeypatch.setitem(globals(), "SENSOR", replace_values(SENSOR, uncertainty={"drift_k": 0.0}))
     built, water, problem = campaign(12, SHIFTED)
-    some = [replace_points(each, slice(None, None, 2)) for each in problem.passes]
     drawing = as_built(SENSOR, WATER)
 
     def passed(earlier):
-        return solve(passes_problem(some, earlier)).calibration
+        return solve(passes_problem(problem.passes, earlier)).calibration
 
     alone = photograph(built, water, drawing, 12)
     last, first = passed(alone).joint, photograph(built, water, passed(drawing), 12).joint
