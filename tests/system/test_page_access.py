@@ -28,6 +28,7 @@ from uwlts.desk.access import MOST_VIEWERS, PageAccess
 from uwlts.desk.board_page import BoardView, update_regularly
 from uwlts.desk.guided import answer_buttons
 from uwlts.desk.guided_screen import BoardScreen
+from uwlts.desk.laser_switch import LaserSwitch
 from uwlts.desk.server import DeskServer
 from uwlts.desk.shown_state import Board, Picture
 from uwlts.errors import SetupError
@@ -56,7 +57,7 @@ class Page(Place):
 def guarded(title: str, **options: object) -> Page:
     """Serve such a page."""
     board = Board(title)
-    screen = BoardScreen(board)
+    screen = BoardScreen(board, LaserSwitch(board, lambda: screen.laser_off()))
 
     def build(shown: Board, operator: bool) -> None:
         view = BoardView(shown)
