@@ -303,11 +303,10 @@ class SweepResult(Brief):
             if found.failure:
                 lines.append(f"rendered {found.label}: {found.failure}")
                 continue
-            largest_mm = max((abs(error) for error in found.error_mm if math.isfinite(error)), default=math.nan)
             verdict = "formulas and rendering agree" if found.agrees else "FORMULAS AND RENDERING DISAGREE"
             lines.append(
                 f"rendered {found.label}: {verdict}, scatter {found.rendered_over_predicted:.2f} of the predicted one, "
-                f"largest systematic error {largest_mm:.3f} mm, {found.seconds:.0f} s"
+                f"largest systematic error {found.largest_error_mm:.3f} mm, {found.seconds:.0f} s"
             )
         return [*lines, f"wrote {self.folder / PAGE}, {TABLE}, {SUMMARY} and {WINNER}"]
 

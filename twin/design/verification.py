@@ -197,6 +197,11 @@ class Agreement:
     seconds: float = math.nan
     failure: str = ""
 
+    @property
+    def largest_error_mm(self) -> float:
+        """Largest systematic error, NaN if it is unknown."""
+        return max((abs(error) for error in self.error_mm if math.isfinite(error)), default=math.nan)
+
 
 def verify_candidate(study: Study, candidate: HighlightedDesign, *, workers: int, variant: str) -> Agreement:
     """Render a candidate of a study in ``workers`` processes and compare its scatter with the prediction."""

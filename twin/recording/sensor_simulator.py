@@ -177,8 +177,7 @@ class SensorSimulator:
 
     def electrons_per_ms(self, shot: Shot, *, spp: int, seed: int, travel: Travel | None = None) -> np.ndarray:
         """Return the mean photo-electrons per ms (H, W) of a shot."""
-        light = self._render_light(shot, spp=spp, seed=seed, travel=travel)
-        return self.formation.electrons_per_ms(light, shot)
+        return self.formation.electrons_per_ms(self._render_light(shot, spp=spp, seed=seed, travel=travel), shot)
 
     def _render_light(
         self,
@@ -273,13 +272,11 @@ class SensorSimulator:
             mean = exposure_ms * self.formation.electrons_of_part(part, of_laser=of_laser)
             return np.maximum(mean, 0, dtype=np.float32)
 
-        parts = [nothing] * 4
-        if laser is not None:
-            paths = laser.direct(), laser.haze, laser.scattered - laser.haze, laser.particles
-            parts = [to_electrons(path, of_laser=True) for path in paths]
+        paths = [] if laser is None else [laser.direct(), laser.haze, laser.scattered - laser.haze, laser.particles]
+        parts = [to_electrons(path, of_laser=True) for path in paths] or [nothing] * 4
         parts.append(to_electrons(even, of_laser=False))
-        noise_seed = [self.options.seed, index]
-        image = self.formation.detect(exposure_ms * per_ms, exposure_ms=exposure_ms, noise_seed=noise_seed)
+        seed = [self.options.seed, index]
+        image = self.formation.detect(exposure_ms * per_ms, exposure_ms=exposure_ms, noise_seed=seed)
         return SimulatedImage(image, exposure_ms, *parts)
 
     def truth(self, shot: Shot) -> FrameTruth:
@@ -327,9 +324,9 @@ class SensorSimulator:
         for shot in dict.fromkeys((shots[len(shots) // 2], shots[0], shots[-1])):
             if probe == "middle" and brightest > 0:
                 break
-            light = self._render_light(shot, spp=PROBE_SPP, seed=0, travel=None)
+            rendered = self._render_light(shot, spp=PROBE_SPP, seed=0, travel=None)
             # If one shot suffices, skip its speckle, which would double the time.
-            peaks = self.formation.electrons_per_ms(light, shot, speckle=probe == "scan").max(axis=axis)
+            peaks = self.formation.electrons_per_ms(rendered, shot, speckle=probe == "scan").max(axis=axis)
             reference = np.sort(peaks)[-1 - min(STRAY_LINES, len(peaks) - 1)]
             lit = peaks[peaks > LIT_SHARE * reference]
             brightest = max(brightest, float(np.quantile(lit, BRIGHT_SHARE)) if len(lit) else 0.0)
