@@ -1,4 +1,4 @@
-"""What a sensor's lens and detector make of the light before the lens: photo-electrons and grey values."""
+"""Formation of images by lens and detector: from the light before the lens to photo-electrons and grey values."""
 
 from typing import TypeAlias
 
