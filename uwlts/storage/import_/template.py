@@ -12,7 +12,7 @@ import numpy as np
 from jinja2 import Environment
 
 from uwlts.errors import ImageError, OutputError, TargetError
-from uwlts.files.writing import write_file
+from uwlts.files.writing import require_ending, write_file
 from uwlts.storage.image_file import read_image
 from uwlts.storage.import_.folder_description import NAME
 from uwlts.storage.import_.grey_values import extract_channel
@@ -106,6 +106,7 @@ def write_template(folder: str | Path, out: str | Path | None = None) -> Path:
     out = folder / NAME if out is None else Path(out)
     if out.exists():
         raise OutputError(f"{out} exists already, and a template replaces nothing: fill it in, or give another name")
+    require_ending(out, (".toml",))
     forms: dict[str, list[str]] = defaultdict(list)
     for name in image_files(folder):
         forms[re.sub("[0-9]+", "#", name)].append(name)
@@ -170,10 +171,7 @@ def _fill_in(name: str, groups: list[_Group]) -> str:
     roles["ignore"] = [group for group in groups if group not in (*lasers, *lamps, *dark)]
     boards = Counter(board[:3] for group in lamps for board in group.boards).most_common(1)
     along = next((line.along for group in lasers for line in group.lines), "")
-    environment = Environment(trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
+    side, most = _find_side(lasers, lamps, along), max(int(image.max()) for group in groups for image in group.images)
     source = files("uwlts.storage.import_").joinpath("template.toml.j2").read_text(encoding="utf-8")
-    return environment.from_string(source).render(
-        {"name": name, "groups": groups, "roles": roles, "boards": boards, "along": along},
-        side=_find_side(lasers, lamps, along),
-        most=max(int(image.max()) for group in groups for image in group.images),
-    )
+    template = Environment(trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True).from_string(source)
+    return template.render(name=name, groups=groups, roles=roles, boards=boards, along=along, side=side, most=most)
