@@ -10,7 +10,9 @@ import pytest
 
 from tests.oracles.pipes import Bump, ScannedPipe, scan_pipe
 from tests.uwlts.inspection.inspected_pipes import BLEMISHES, GATE, cloud_of, inspect
+from uwlts.inspection.blemish_search import BlemishSearch, Indication
 from uwlts.inspection.features import Feature, FeatureKind, Inspection
+from uwlts.inspection.pipe import _join_copies
 from uwlts.inspection.pipe_form import fit_pipe, refit_pipe
 from uwlts.shapes.cylinder import Cylinder
 
@@ -76,6 +78,23 @@ def test_a_dent_at_the_cut_is_one_finding() -> None:
         )
         (own,) = matched(pipe, inspect(pipe, false_alarm=FALSE_ALARM), [dent])
         assert own.kind == FeatureKind.DENT
+
+
+def test_copies_of_an_indication_on_both_sides_of_the_cut_are_joined() -> None:
+    """Points 8 to 11 are copies of 0 to 3: two indications share point 2, one of the other sign shares it alone."""
+    copied, nothing = np.array([*range(8), *range(4)]), np.zeros(12, bool)
+    found = [
+        Indication(2.0, height, 9.0, 1e-9, 0.02, np.array(points))
+        for height, points in ((-1.0, [1, 2]), (-1.0, [10, 11, 7]), (1.0, [2]), (-1.0, [5]))
+    ]
+    search = BlemishSearch(tuple(found), (), nothing, ~nothing, np.ones(12), 1.0, 1.0, 5.0, 1e-4)
+    joined = _join_copies(search, copied, 8)
+    assert [(each.height_mm, each.points.tolist()) for each in joined.indications] == [
+        (-1.0, [1, 2, 3, 7]),
+        (1.0, [2]),
+        (-1.0, [5]),
+    ]
+    assert joined.undamaged.tolist() == [True, False, False, False, True, False, True, False]
 
 
 @pytest.mark.parametrize("axis", AXES.values(), ids=AXES)
