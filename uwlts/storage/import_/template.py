@@ -1,4 +1,4 @@
-"""Description of a folder of images to fill in: what the images show, and questions where they cannot tell."""
+"""Description of a folder of images to fill in: what the images show, and questions for the rest."""
 
 import re
 from collections import Counter, defaultdict
@@ -25,9 +25,8 @@ from uwlts.targets.detection import convert_to_eight_bit, detect_lattice, find_l
 _EXAMINED = 8  # images of a group that are examined, evenly spaced
 _CHANNELS = ("red", "green", "blue", "red - max(green, blue)", "green - max(red, blue)", "blue - max(red, green)")
 _LINES, _HEIGHT, _SMOOTH = 0.4, 0.35, 0.9
-"""Of a laser line: least fraction of profile lines, height relative to the brightest pixels, and fraction of steps
-below 3 px. Chosen on tests/data/ciclop and etna, where lines have 0.45, 0.52 and 0.96, edges of boards 0.3 at most in
-height; checked on rendered images (tests/uwlts/storage/test_template.py)."""
+"""Of a laser line: least fraction of profile lines, height relative to the brightest pixels, share of steps below 3 px.
+Chosen on tests/data/ciclop and etna: lines have 0.45, 0.52 and 0.96, edges of boards 0.3 at most in height."""
 _CHANGED, _SAME = 0.1, 0.05
 """An image and its background differ by more than this fraction of the brightest pixel in less than this fraction of
 the pixels: in 0.02 in tests/data/ciclop, other pairs there in 0.67 and more."""
@@ -90,10 +89,8 @@ class _Group:
 def write_template(folder: str | Path, out: str | Path | None = None) -> Path:
     """Write a description of a folder of images for `import_images`, as far as the images show it, to be filled in.
 
-    Sizes, channels, lights, numbers, target, direction of the laser's line and side of the laser are taken from the
-    images, eight of each kind. Every other value is the question "?", which an import refuses by name. Returns the path
-    of the description. ImageError if the folder contains no image, or its images are damaged or have several sizes;
-    OutputError if the description exists or cannot be written.
+    Values that eight images of each kind do not show are "?", which an import refuses by name. ImageError if there is no
+    image, or images are damaged or of several sizes; OutputError if the description exists or cannot be written.
 
     Parameters
     ----------
@@ -101,6 +98,11 @@ def write_template(folder: str | Path, out: str | Path | None = None) -> Path:
         Folder of PNG, TIFF, BMP or JPEG images of one camera.
     out : str or Path, optional
         Description to write; by default import.toml in the folder.
+
+    Returns
+    -------
+    Path
+        The description.
     """
     folder = Path(folder)
     out = folder / NAME if out is None else Path(out)
