@@ -89,8 +89,8 @@ class _Group:
 def write_template(folder: str | Path, out: str | Path | None = None) -> Path:
     """Write a description of a folder of images for `import_images`, as far as the images show it, to be filled in.
 
-    Values that eight images of each kind do not show are "?", which an import refuses by name. ImageError if there is no
-    image, or images are damaged or of several sizes; OutputError if the description exists or cannot be written.
+    Values that eight images of each kind do not show are "?", which an import refuses by name. ImageError without an
+    image, or if images are damaged or of several sizes; OutputError if the description exists or cannot be written.
 
     Parameters
     ----------
