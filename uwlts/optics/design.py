@@ -25,10 +25,8 @@ from typing import Any
 import numpy as np
 
 from uwlts.errors import DesignError
-from uwlts.model.calibration import CameraModel
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Camera, Medium, Sensor, Window
-from uwlts.optics.camera import directions
 
 Array = Any  # NumPy array, Dr.Jit array, or number
 Vector = tuple[Array, Array, Array]
@@ -72,24 +70,6 @@ class LaserFan:
     axis: Vector
     fan: Vector
     normal: Vector
-
-
-def place_laser(xp: ModuleType, *, baseline_mm: Array, angle_rad: Array, roll_rad: Array, towards: Vector) -> LaserFan:
-    """Return the fan of a laser that is placed by baseline and triangulation angle.
-
-    The result is that of `uwlts.model.placement.laser_pose`, but differentiable.
-
-    ``xp`` is NumPy or Dr.Jit, ``towards`` the direction (x, y, 0) of the baseline, and ``roll_rad`` the rotation of the
-    fan about the laser's axis.
-    """
-    sine, cosine = xp.sin(angle_rad), xp.cos(angle_rad)
-    axis = (-sine * towards[0], -sine * towards[1], cosine)
-    across = (cosine * towards[0], cosine * towards[1], sine)
-    along = (-towards[1], towards[0], 0.0 * sine)
-    turn, keep = xp.sin(roll_rad), xp.cos(roll_rad)
-    normal = add_vectors(scale_vector(across, keep), scale_vector(along, turn))
-    fan = add_vectors(scale_vector(along, keep), scale_vector(across, -turn))
-    return LaserFan(scale_vector(towards, baseline_mm), axis, fan, normal)
 
 
 def standoff_mm(pose: LaserFan) -> Array:
@@ -260,11 +240,6 @@ class ImagePoints:
     path: Path
     slopes: tuple[Array, Array]
     jacobian: tuple[Array, Array, Array, Array]
-
-
-def trace_pixels(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """Return the rays (N, 3) in air of pixels (N, 2) of a described camera; NaN beyond the domain of its distortion."""
-    return directions(CameraModel.from_description(camera), pixels)
 
 
 def project_points(xp: ModuleType, lens: Lens, window: WindowGeometry, point: Vector) -> ImagePoints:
