@@ -79,7 +79,6 @@ SERVING = {
     "test_desk_screens.py",
     "test_serve.py",
     "test_gige_camera.py",
-    "test_calibrate_live.py",
     "test_scan_command.py",
     "test_continuous_scan.py",
     "test_scan_exposure.py",

@@ -1,10 +1,12 @@
-"""Processes of the desk that begin with its libraries imported, which costs two seconds in each new interpreter."""
+"""Processes of scans and of the desk that begin with the libraries imported: two seconds in each new interpreter."""
 
 import multiprocessing
 import os
+import resource
 import signal
 import sys
 from collections.abc import Callable
+from threading import Timer
 from typing import TextIO
 
 from uwlts.cli import main
@@ -40,6 +42,10 @@ class Preloaded:
         """Return the exit code, None if the process runs."""
         return self._process.exitcode
 
+    @property
+    def returncode(self) -> int | None:
+        return self.poll()
+
     def send_signal(self, number: signal.Signals) -> None:
         os.kill(self.pid, number)
 
@@ -51,21 +57,30 @@ class Preloaded:
         self._process.join(seconds)
         return self.poll()
 
-    def communicate(self) -> tuple[str, str]:
-        """Wait for the end, and return what it wrote."""
+    def communicate(self, timeout: float | None = None) -> tuple[str, str]:
+        """Wait for the end, and return what it wrote; a process that runs for longer than ``timeout`` s is killed."""
+        late = Timer(timeout, self.kill) if timeout else None
+        if late:
+            late.start()
         if not self.stdout.closed:
             with self.stdin, self.stdout, self.stderr:
                 self._written = self.stdout.read(), self.stderr.read()
         self.wait()
+        if late:
+            late.cancel()
         return self._written
 
 
-def uwlts(*words: str) -> Preloaded:
+def uwlts(*words: object) -> Preloaded:
     """Start the command ``uwlts``."""
-    return Preloaded(_run_uwlts, *words)
+    return Preloaded(run_uwlts, *map(str, words))
 
 
-def _run_uwlts(*words: str) -> None:
+def run_uwlts(*words: str) -> None:
+    """Run the command in this process, which ends by signals as in a terminal, and writes no core."""
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    for number in (signal.SIGHUP, signal.SIGQUIT):
+        signal.signal(number, signal.SIG_DFL)
     sys.argv = ["uwlts", *words]
     main()
 

@@ -5,9 +5,15 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from types import FrameType
+
+import numpy as np
 
 import uwlts
+from tests.uwlts.evaluation.test_artefact_figures import DUMBBELL, cloud_of, dumbbell
+from uwlts.argument_types import _read_hints
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -210,3 +216,47 @@ def test_named_numbers_have_a_reason():
         if (names := silent_numbers(path.read_text(encoding="utf-8")))
     }
     assert not silent
+
+
+MOST_STOPS = {"file": (47, 84), "cloud": (16, 56)}
+"""Functions of the product that a reader of `evaluate` meets before the search of the spheres, and in all.
+
+For a PLY file of two spheres, and for a cloud in memory. Of those of the file, 8 check the arguments, 34 read the file
+and check its content, 5 resolve the artefact, 26 find and fit the spheres, and 11 compute the figures. Each checks or
+computes what no other one does. Lower the numbers when a simpler rule replaces some; none is raised.
+"""
+
+
+def stops(function: Callable[..., object], *args: object) -> list[str]:
+    """Return the functions of the product that a call enters, in the order of their first entry.
+
+    Lambdas and comprehensions belong to the function that they stand in.
+    """
+    found: dict[str, None] = {}
+
+    def note(frame: FrameType, event: str, _: object) -> None:
+        code = frame.f_code
+        path = Path(code.co_filename)
+        if event == "call" and code.co_name[0] != "<" and path.is_relative_to(ROOT):
+            place = path.relative_to(ROOT)
+            if place.parts[0] in ("uwlts", "twin"):
+                found[f"{place}:{code.co_qualname}"] = None
+
+    sys.setprofile(note)
+    try:
+        function(*args)
+    finally:
+        sys.setprofile(None)
+    return list(found)
+
+
+def test_evaluating_a_cloud_makes_few_stops(tmp_path: Path):
+    cloud = cloud_of(dumbbell(np.random.default_rng(0)))
+    cloud.save(tmp_path / "spheres.ply")
+    for kind, given in (("file", tmp_path / "spheres.ply"), ("cloud", cloud)):
+        _read_hints.cache_clear()
+        found = stops(uwlts.evaluate, given, DUMBBELL)
+        before = found.index("uwlts/evaluation/artefact_figures.py:evaluate_spheres")
+        assert any(each.endswith(":Sphere.fit") for each in found[before:])
+        most_before, most = MOST_STOPS[kind]
+        assert before <= most_before and len(found) <= most, (before, len(found), found)

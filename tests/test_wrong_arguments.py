@@ -49,7 +49,7 @@ def call_with(function: Callable[..., Any], parameter: str, value: object) -> No
 
 @pytest.mark.parametrize(
     ("package", "least"),
-    [("uwlts", 23), ("uwlts.desk", 3), ("uwlts.thesis", 1), ("uwlts.report", 8), ("uwlts.plot", 3), ("twin", 9)],
+    [("uwlts", 23), ("uwlts.desk", 2), ("uwlts.thesis", 1), ("uwlts.report", 8), ("uwlts.plot", 3), ("twin", 9)],
 )
 def test_wrong_types_raise_errors_that_name_the_argument(
     package: str, least: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

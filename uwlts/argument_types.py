@@ -108,7 +108,11 @@ def check_arguments(function: Callable[P, R], *, keep_inputs: bool = False) -> C
             if name not in hints or kind is inspect.Parameter.VAR_KEYWORD:
                 continue
             several = kind is inspect.Parameter.VAR_POSITIONAL
-            values = [_check_and_convert(name, each, hints[name]) for each in (value if several else (value,))]
+            given = value if several else (value,)
+            values = [_convert(each, hints[name]) for each in given]
+            for each, converted in zip(given, values, strict=True):
+                if converted is _MISFIT:
+                    raise ArgumentError(_describe_misfit(name, each, hints[name]))
             bound.arguments[name] = tuple(values) if several else values[0]
         with protect_inputs(bound.arguments) if keep_inputs else nullcontext():
             return function(*bound.args, **bound.kwargs)
@@ -127,13 +131,11 @@ def _read_hints(function: Callable[..., Any]) -> dict[str, Any]:
     )
 
 
-def _check_and_convert(name: str, value: Any, hint: Any) -> Any:
-    if (converted := _convert(value, hint)) is not _MISFIT:
-        return converted
+def _describe_misfit(name: str, value: Any, hint: Any) -> str:
     shown = _SHORT.repr(value)
     single = any(_is_list(kind) and _convert([value], kind) is not _MISFIT for kind in union_members(hint))
     advice = f"; give a single one as [{shown}]" if single else ""
-    raise ArgumentError(f"`{name}` is {shown} ({type(value).__name__}), expected {_describe(hint)}{advice}")
+    return f"`{name}` is {shown} ({type(value).__name__}), expected {_describe(hint)}{advice}"
 
 
 def union_members(hint: Any) -> Iterator[Any]:
@@ -163,25 +165,22 @@ def _is_path(kind: Any) -> bool:
 
 def _convert(value: Any, hint: Any) -> Any:
     """Return a value in one of the types of a union, or `_MISFIT`."""
-    converted = (_convert_to_one(value, kind) for kind in union_members(hint))
-    return next((each for each in converted if each is not _MISFIT), _MISFIT)
-
-
-def _convert_to_one(value: Any, kind: Any) -> Any:
-    origin, parts = get_origin(kind) or kind, get_args(kind)
-    if origin in (Any, object):
-        return value
-    if origin is Literal:
-        fits = any(value == word for word in parts if _is_instance(value, type(word)))
-    elif origin in (Sequence, list, tuple):
-        return _convert_entries(value, origin, parts)
-    elif _is_array(kind):
-        return _convert_to_array(value)
-    elif origin in (Mapping, dict):
-        fits = isinstance(value, Mapping) and all(_convert(each, parts[1]) is not _MISFIT for each in value.values())
-    else:
-        fits = _is_instance(value, origin)
-    return value if fits else _MISFIT
+    for kind in union_members(hint):
+        origin, parts = get_origin(kind) or kind, get_args(kind)
+        converted, fits = value, True
+        if origin is Literal:
+            fits = any(value == word for word in parts if _is_instance(value, type(word)))
+        elif origin in (Sequence, list, tuple):
+            converted = _convert_entries(value, origin, parts)
+        elif _is_array(kind):
+            converted = _convert_to_array(value)
+        elif origin in (Mapping, dict):
+            fits = isinstance(value, Mapping) and all(_convert(one, parts[1]) is not _MISFIT for one in value.values())
+        elif origin not in (Any, object):
+            fits = _is_instance(value, origin)
+        if fits and converted is not _MISFIT:
+            return converted
+    return _MISFIT
 
 
 def _is_instance(value: Any, kind: Any) -> bool:

@@ -207,28 +207,6 @@ def pipeline() -> list[Row]:
     return [*rows, at_most(f"the {found} circles of a target in view found, on one core", seconds, "s", 0.3, labelled)]
 
 
-def reproduction() -> list[Row]:
-    """Time per image of the thesis's campaign, its scans thinned: 3,000 images in half an hour are 600 ms."""
-    from tests.bench.floors import stock_frame_seconds
-    from twin.recording.campaigns import RecordingOptions, record_campaigns
-    from twin.scene.campaign import load_campaign
-
-    images = 0
-
-    def count(done: int, total: int) -> None:
-        nonlocal images
-        images = total
-
-    with tempfile.TemporaryDirectory() as folder:
-        start = time.perf_counter()
-        options = RecordingOptions(every=30)
-        record_campaigns(load_campaign("thesis"), Path(folder), seeds=range(1), options=options, progress=count)
-        seconds = time.perf_counter() - start
-    stock = Floor(STOCK_FRAME, 1e3 * stock_frame_seconds(), 1.0)
-    name = f"the thesis's campaign, thinned to {images} images"
-    return [at_most(name, 1e3 * seconds / images, "ms/image", 500, stock)]
-
-
 def studies() -> list[Row]:
     """Speed of design studies."""
     from tests.bench.study import screening, verification
@@ -280,17 +258,6 @@ def live() -> list[Row]:
     return [
         at_least("frames of 640 x 512 while the stage moves, all effects", frame_rate(), "frames/s", 30),
         at_least(f"the same without {' and '.join(LESS_LIGHT)}", frame_rate(*LESS_LIGHT), "frames/s", 30),
-    ]
-
-
-def streams() -> list[Row]:
-    """Memory of long rides: profiles of 640 lines with a path, from 2,000 to 10,000."""
-    from tests.bench.streams import stream_memory
-
-    peak_gb, growth_kb = stream_memory(2000, 10000)
-    return [
-        at_most("10,000 profiles of a vehicle reconstructed with covariance: peak memory", peak_gb, "GB", 4),
-        at_most("the same: growth of the memory", growth_kb, "kB/profile", 30),
     ]
 
 
@@ -351,21 +318,7 @@ def commands() -> list[Row]:
     ]
 
 
-_ALL = (
-    demo,
-    reproduction,
-    rendering,
-    light,
-    campaign,
-    pipeline,
-    studies,
-    datasets,
-    sensors,
-    live,
-    streams,
-    hardware,
-    commands,
-)
+_ALL = (demo, rendering, light, campaign, pipeline, studies, datasets, sensors, live, hardware, commands)
 SECTIONS = {section.__name__: section for section in _ALL}
 
 

@@ -1,11 +1,10 @@
-"""Memory of the reconstruction of long rides: images of a sensor on a vehicle, with path, mount and covariance."""
+"""Recording of a long ride on a vehicle, with path, mount and covariance, and the cost of a command on it."""
 
 import os
 import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import h5py
 import numpy as np
@@ -37,16 +36,6 @@ class Cost:
     processor_s: float
     peak_gb: float
     limit_gb: float
-
-
-def stream_memory(few: int, many: int) -> tuple[float, float]:
-    """Return the peak memory of the longer ride in GB, and the growth in kB per profile."""
-    peaks = []
-    for frames in (few, many):
-        with TemporaryDirectory() as name:
-            write_ride(Path(name), frames)
-            peaks.append(run_alone(RECONSTRUCT, Path(name), np.inf).peak_gb)
-    return peaks[1], 1e6 * (peaks[1] - peaks[0]) / (many - few)
 
 
 def write_ride(folder: Path, frames: int) -> None:

@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import Noise, gathered, target_series
 from tests.uwlts.mount_views import sphere_campaign
-from tests.uwlts.storage.test_capture import a_header, interrupted, record, small_sensor
+from tests.uwlts.storage.drawn_captures import a_header, interrupted, record, small_sensor
 from tests.uwlts.storage.test_cloud import some_cloud, some_uncertainty
 from tests.uwlts.storage.test_ros_bags import messages, write_ros2
 from tests.uwlts.storage.test_truth import a_header as truth_header, a_truth

@@ -19,52 +19,50 @@ CASES = 100
 
 
 @pytest.fixture(scope="module")
-def stored(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Outcome]:
-    """Return the outcomes of the corpus, by path, and of past failures, by their words. One process reads them all."""
-    folder = tmp_path_factory.mktemp("stored")
-    files = {str(path): (path.name.split("--")[0], str(path)) for path in sorted(CORPUS.glob("*--*"))}
+def outcomes(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Outcome]]:
+    """Return outcomes of the corpus and of past failures, each by its words, and those of changed files by reader.
+
+    One process reads them all, changed files only of the chosen tests of this module.
+    """
+    folder = tmp_path_factory.mktemp("read")
+    work = [(str(path), path.name.split("--")[0], str(path)) for path in sorted(CORPUS.glob("*--*"))]
     for number, (words, (reader, build)) in enumerate(PAST.items()):
         (folder / reader).mkdir(exist_ok=True)
         path = folder / reader / f"past-{number}{READERS[reader].suffix}"
         build(path)
-        files[words] = reader, str(path)
-    return dict(zip(files, watched(folder, files.values()), strict=True))
-
-
-def test_past_failures_are_refused(stored: dict[str, Outcome]):
-    outcomes = {words: stored[words] for words in PAST}
-    assert {words: each.fault for words, each in outcomes.items() if each.fault} == {}
-    # An altered certificate is reported, not rejected.
-    assert [words for words, each in outcomes.items() if not each.refusal] == []
-    assert max(each.seconds for each in outcomes.values()) < MOST_S
-    assert max(each.mib for each in outcomes.values()) < MOST_MIB
-    assert "is an HDF5 file, such as a capture" in outcomes["capture as a calibration"].refusal
-
-
-def test_corpus(stored: dict[str, Outcome]):
-    outcomes = [outcome for name, outcome in stored.items() if name not in PAST]
-    assert outcomes and [each for each in outcomes if each.fault] == []
-
-
-@pytest.fixture(scope="module")
-def outcomes_of(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Outcome]]:
-    """Return the outcomes of changed files by reader. One process reads for all chosen tests of this module."""
+        work.append((words, reader, str(path)))
     items = [item for item in request.session.items if isinstance(item, pytest.Function) and item.path == request.path]
     params = [item.callspec.params for item in items if hasattr(item, "callspec")]
     chosen = [values["reader"] for values in params if "reader" in values]
-    outcomes = watched(
-        tmp_path_factory.mktemp("changed"), [(reader, str(number)) for reader in chosen for number in range(CASES)]
-    )
-    return {reader: [outcome for outcome in outcomes if outcome.reader == reader] for reader in chosen}
+    work += [(reader, reader, str(number)) for reader in chosen for number in range(CASES)]
+    found: dict[str, list[Outcome]] = {}
+    for (words, *_), outcome in zip(work, watched(folder, [case for _, *case in work]), strict=True):
+        found.setdefault(words, []).append(outcome)
+    return found
+
+
+def test_past_failures_are_refused(outcomes: dict[str, list[Outcome]]):
+    past = {words: outcomes[words][0] for words in PAST}
+    assert {words: each.fault for words, each in past.items() if each.fault} == {}
+    # An altered certificate is reported, not rejected.
+    assert [words for words, each in past.items() if not each.refusal] == []
+    assert max(each.seconds for each in past.values()) < MOST_S
+    assert max(each.mib for each in past.values()) < MOST_MIB
+    assert "is an HDF5 file, such as a capture" in past["capture as a calibration"].refusal
+
+
+def test_corpus(outcomes: dict[str, list[Outcome]]):
+    found = [each for words in outcomes.keys() - PAST.keys() - READERS.keys() for each in outcomes[words]]
+    assert found and [each for each in found if each.fault] == []
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("reader", READERS)
-def test_changed_files_are_read_or_refused(outcomes_of: dict[str, list[Outcome]], reader: str):
-    outcomes = outcomes_of[reader]
-    assert [each for each in outcomes if each.fault] == []
+def test_changed_files_are_read_or_refused(outcomes: dict[str, list[Outcome]], reader: str):
+    found = outcomes[reader]
+    assert [each for each in found if each.fault] == []
     # The mutations have an effect: not all files are still read.
-    assert len(outcomes) == CASES and sum(bool(each.refusal) for each in outcomes) > 0.1 * CASES
+    assert len(found) == CASES and sum(bool(each.refusal) for each in found) > 0.1 * CASES
 
 
 @settings(max_examples=300, deadline=None)

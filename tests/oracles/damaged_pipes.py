@@ -46,11 +46,10 @@ def of_pipe(pipe: ScannedPipe, *reliefs: Relief, reach_mm: float = 2.0) -> Part:
     low, high = along.min() - 60, along.max() + 60
     count = [int((high - low) / 0.2), int(2 * np.pi * pipe.radius_mm / 0.2)]
     sides = np.linspace(low, high, count[0]), np.linspace(-np.pi, np.pi, count[1])
-    grid_mm, grid_angle = np.meshgrid(*sides, indexing="ij")
     steps = reach_mm * np.array([(a, b) for a in (-1, -0.5, 0, 0.5, 1) for b in (-1, -0.5, 0, 0.5, 1)])
     truths = []
     for relief in reliefs:
-        depth = -float(np.min(relief.heights(grid_mm, grid_angle, pipe.radius_mm)))
+        depth = _greatest_depth(relief, *sides, pipe.radius_mm)
 
         def covers(places: np.ndarray, relief: Relief = relief, depth: float = depth) -> np.ndarray:
             at, around = pipe.own_places(places)
@@ -59,6 +58,16 @@ def of_pipe(pipe: ScannedPipe, *reliefs: Relief, reach_mm: float = 2.0) -> Part:
 
         truths.append(Truth(values={"depth": depth}, covers=covers))
     return Part(points_mm=pipe.points_mm, frame=pipe.frame, line=pipe.line, truths=tuple(truths))
+
+
+def _greatest_depth(relief: Relief, along_mm: np.ndarray, angle: np.ndarray, radius_mm: float) -> float:
+    """Return the depth on a grid, searched where every eighth point of it shows the relief, and a cell around."""
+    coarse = np.abs(relief.heights(*np.meshgrid(along_mm[::8], angle[::8], indexing="ij"), radius_mm))
+    shown = np.nonzero(coarse > 1e-3 * coarse.max())
+    near = (
+        side[8 * max(at.min() - 1, 0) : 8 * (at.max() + 2)] for side, at in zip((along_mm, angle), shown, strict=True)
+    )
+    return -float(np.min(relief.heights(*np.meshgrid(*near, indexing="ij"), radius_mm)))
 
 
 def _draw_pipe(rng: np.random.Generator, *, points: float = 12_000) -> dict[str, Any]:

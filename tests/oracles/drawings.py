@@ -64,8 +64,9 @@ def circles(centres_mm: np.ndarray, diameter_mm: float, *, bright: bool = False,
 
     def levels(places: np.ndarray) -> np.ndarray:
         on_plate = ((places >= low) & (places <= high)).all(axis=1)
-        near, inside = places[on_plate], np.zeros(len(places), bool)
-        inside[on_plate] = np.any([np.hypot(*(near - centre).T) <= diameter_mm / 2 for centre in centres_mm], axis=0)
+        inside = np.zeros(len(places), bool)
+        x, y = places[on_plate].T
+        inside[on_plate] = np.any([(x - u) ** 2 + (y - v) ** 2 <= diameter_mm**2 / 4 for u, v in centres_mm], axis=0)
         return np.where(inside, circle, np.where(on_plate, plate, 0.3))
 
     return levels

@@ -33,6 +33,7 @@ _MOST_PLACES = {"target": 5, "target-through-window": 5, "step": 3}
 _PLACES = 12
 _SAMPLES = "2"
 """Samples per lit pixel: stripes and circles are found with as few."""
+OVERWRITE = " --overwrite"
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,35 @@ class Page:
     """Beginning of a command: preparation before it runs."""
     ready: dict[str, str] = field(default_factory=dict)
     """Beginning of a command that runs until Ctrl-C: words that it prints when it is ready."""
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """Commands that several pages take for granted or contain, run once in a folder, and the files of each."""
+
+    folder: Path
+    files: dict[str, list[Path]] = field(default_factory=dict)
+
+    def run(self, commands: str, small: Path) -> None:
+        """Run command lines in the folder."""
+        runner = Runner(self.folder, small)
+        for command in commands.strip().splitlines():
+            before = set(self.folder.rglob("*"))
+            runner.command(command)
+            made = [path for path in self.folder.rglob("*") if path not in before and path.is_file()]
+            self.files[command] = [path.relative_to(self.folder) for path in made]
+
+    def copied(self, command: str, folder: Path) -> bool:
+        """Copy the files of a command with the same words and the same inputs; False if there is none."""
+        words = [word for word in words_of(command) if (self.folder / word).is_file()]
+        inputs = [Path(word) for word in words if Path(word) not in self.files.get(command, [])]
+        same = all((folder / path).exists() and (folder / path).samefile(self.folder / path) for path in inputs)
+        if command not in self.files or not same:
+            return False
+        for path in self.files[command]:
+            (folder / path).unlink(missing_ok=True)
+            _copied(self.folder / path, folder / path)
+        return True
 
 
 def write_small_descriptions(folder: Path) -> None:
@@ -93,15 +123,18 @@ class Runner:
     """Runs command lines and Python in a folder; `small` holds the smaller descriptions.
 
     The project's own commands run in this process, unless `separate`: signals and terminals are as for a user then.
+    Commands of the shared campaign are not run again.
     """
 
-    def __init__(self, folder: Path, small: Path, *, separate: bool = False) -> None:
-        self.folder, self.small, self.separate = folder, small, separate
+    def __init__(self, folder: Path, small: Path, *, shared: Campaign | None = None, separate: bool = False) -> None:
+        self.folder, self.small, self.shared, self.separate = folder, small, shared, separate
         self.names: dict[str, Any] = {"__name__": "page"}
         self._going: list[subprocess.Popen[str]] = []
 
     def command(self, command: str, *, ready: str | None = None) -> str:
         """Run a command line, or start it until it has printed `ready`; return what it printed."""
+        if self.shared and self.shared.copied(command.removesuffix(OVERWRITE), self.folder):
+            return ""
         words = [name for word in words_of(command) for name in self._expanded(word)]
         if words[0] == "cd":
             # A copy: files written by the commands there do not belong in the project.
@@ -178,11 +211,13 @@ class Runner:
         return said
 
 
-def run_page(page: Path, how: Page, *, shared: Path | None, folder: Path, small: Path, separate: bool = False) -> int:
+def run_page(
+    page: Path, how: Page, *, shared: Campaign | None, folder: Path, small: Path, separate: bool = False
+) -> int:
     """Run all blocks of a page in a folder, and return how many commands and Python blocks ran."""
     for name, source in how.given.items():
         assert shared
-        _copied(shared / source, folder / name)
+        _copied(shared.folder / source, folder / name)
     for name, text in how.texts.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text, encoding="utf-8")
@@ -195,7 +230,7 @@ def run_page(page: Path, how: Page, *, shared: Path | None, folder: Path, small:
     unused = set(beginnings)
     unused |= {word for word in how.instead if not any(word in tables[number] for number in how.tables.values())}
     ran = 0
-    with _running(folder, small, separate) as runner:
+    with _running(Runner(folder, small, shared=shared, separate=separate)) as runner:
         for line in how.before.strip().splitlines():
             runner.command(line.strip())
         for block in blocks(page):
@@ -214,7 +249,7 @@ def run_page(page: Path, how: Page, *, shared: Path | None, folder: Path, small:
                     runner.python(block, text, smaller=how.small_python)
                 else:
                     ready = next((words for begin, words in how.ready.items() if begin in listed), None)
-                    runner.command(text + " --overwrite" * bool(listed & set(how.again)), ready=ready)
+                    runner.command(text + OVERWRITE * bool(listed & set(how.again)), ready=ready)
                 ran += 1
         exec(compile(how.figures, f"figures of {page}", "exec"), runner.names)
     assert not unused, f"{page} does not say what is listed for it: {unused}"
@@ -230,8 +265,7 @@ def _instead(text: str, instead: dict[str, str], unused: set[str]) -> str:
 
 
 @contextmanager
-def _running(folder: Path, small: Path, separate: bool) -> Iterator[Runner]:
-    runner = Runner(folder, small, separate=separate)
+def _running(runner: Runner) -> Iterator[Runner]:
     try:
         yield runner
     finally:

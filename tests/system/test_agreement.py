@@ -34,7 +34,8 @@ def study() -> Study:
         "laser.baseline_mm": {"least": 150.0, "most": 400.0},
         "laser.triangulation_angle_deg": {"least": 15.0, "most": 60.0},
     }
-    return Study.model_validate({"title": "test", "variables": variables, "follow": ["focus", "waist", "volume"]})
+    table = {"title": "test", "sensor": "thesis-small", "variables": variables, "follow": ["focus", "waist", "volume"]}
+    return Study.model_validate(table)
 
 
 def test_formulas_foretell_what_a_rendered_design_measures(study):

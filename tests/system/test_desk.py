@@ -6,8 +6,6 @@ Screenshots of the first run are stored in the folder named by UWLTS_SCREENSHOTS
 import os
 import re
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +17,7 @@ import pytest
 
 import uwlts
 from tests import preloaded
+from tests.system import in_process
 from tests.system.small_board import small_sensor, turned_board
 from tests.system.test_laser_off_attacked import light
 from tests.waiting import suspend, within
@@ -668,6 +667,5 @@ def test_ctrl_c_ends_a_scan_in_the_dark(desk, page, served):
 
 @pytest.mark.slow
 def test_a_folder_that_is_not_there_is_refused(tmp_path):
-    words = ["desk", str(tmp_path / "nowhere")]
-    done = subprocess.run([sys.executable, "-m", "uwlts", *words], capture_output=True, text=True, timeout=60)
+    done = in_process.uwlts("desk", tmp_path / "nowhere")
     assert done.returncode != 0 and "there is no folder" in done.stderr and "Traceback" not in done.stderr

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 import uwlts
 from tests.documented import PAGES, ROOT, blocks, name_of
-from tests.system.documented_runs import Page, Runner, run_page, write_small_descriptions
+from tests.system.documented_runs import Campaign, Page, Runner, run_page, write_small_descriptions
 from tests.system.in_process import shared_workers
 from tests.system.test_camera_command import TARGET as BOARD
 from tests.system.test_documented_hardware import PAGES_RUN as HARDWARE_PAGES
@@ -37,12 +37,27 @@ twin simulate spheres --placement standoff --seed 1 --as-built thesis-as-built -
 twin simulate pipe --as-built thesis-as-built --out pipe.h5
 twin simulate plane --as-built thesis-as-built --out plane.h5
 twin simulate weld --as-built thesis-as-built --out weld.h5
-uwlts calibrate --air target-air.h5 --water target-water.h5 --step step-near.h5 step-far.h5 --out calibration.json
-uwlts certificate calibration.json --out certificate.html
-uwlts reconstruct spheres.h5 --calibration calibration.json --out spheres.cloud.h5
-uwlts reconstruct pipe.h5 --calibration calibration.json --out pipe.cloud.h5
-uwlts reconstruct weld.h5 --calibration calibration.json --out weld.cloud.h5
+twin simulate robot-sphere --sensor thesis-small --out robot.h5
+twin simulate vehicle-pass --sensor thesis-small --out pass.h5
+uwlts calibrate --air target-air.h5 --water target-water.h5 --step step-near.h5 step-far.h5 --out joint.json
+uwlts certificate joint.json --out certificate.html
+uwlts reconstruct spheres.h5 --calibration joint.json --out spheres.cloud.h5
+uwlts reconstruct pipe.h5 --calibration joint.json --out pipe.cloud.h5
+uwlts reconstruct weld.h5 --calibration joint.json --out weld.cloud.h5
+twin sweep baseline-angle
+twin dataset small-set.toml --scenes 1 --out runs/turbid
 """
+SMALL_SET = """
+licence = "CC0-1.0"
+sensor = "thesis-small"
+scene = "shapes"
+spp = 2
+splits = { train = 0.8, test = 0.2, validation = 0 }
+motion = { start_mm = -12.0, step_mm = 8.0, count = 4 }
+vary = { "scene.objects.2.diameter_mm" = { kind = "uniform", least = 25.0, most = 60.0 } }
+"""
+"""In place of a preset, whose scene takes half a minute of processor time."""
+A_SET = {"stripe-turbid --scenes 200": "small-set.toml --scenes 1"}
 
 MAKE = {"make ": "`make test-full` runs this test, and demo, bench, docs and check take minutes each"}
 INSTALL = {"pip install": "make does it", "twin demo": "takes a minute; tests/system/test_campaign.py runs it"}
@@ -54,9 +69,11 @@ NEEDS_ROS = "needs ROS 2: tests/ros_node.py runs it"
 THREE_VIEWS = {"top.cloud.h5": "pipe.cloud.h5"} | {f"{side}.cloud.h5": f"{side}.cloud.h5" for side in ("left", "right")}
 NO_MOVEMENT = "1,0,0,0,0,1,0,0,0,0,1,0\n" * 3
 ROBOT = """
-twin simulate robot-sphere --out robot.h5
-uwlts nominal thesis --medium water --out calibration.json
-uwlts mount robot.h5 --calibration calibration.json --radius-mm 19.05 --out mount.json
+twin simulate robot-sphere --sensor thesis-small --out robot.h5
+uwlts nominal thesis-small --medium water --out calibration.json
+uwlts mount robot.h5 --calibration calibration.json --radius-mm 19.05 --out robot-mount.json
+twin simulate robot-target --sensor thesis-small --out board.h5
+cp robot.h5 scan.h5
 """
 
 
@@ -118,7 +135,7 @@ def photographs_on_a_robot(runner: Runner) -> None:
 
 def trajectory_for_tum(runner: Runner) -> None:
     """The vehicle's trajectory as the benchmark of TU Munich writes them: s, m, quaternion x y z w."""
-    with (runner.folder / "vehicle.trajectory.csv").open(encoding="utf-8") as file:
+    with (runner.folder / "pass.trajectory.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     names = list(rows[0])
     time = names.index("time_s")
@@ -130,7 +147,7 @@ def trajectory_for_tum(runner: Runner) -> None:
     )
     values[:, 1:4] /= 1e3
     np.savetxt(runner.folder / "path.tum", values, fmt="%.9f")
-    shutil.copy(runner.folder / "vehicle.h5", runner.folder / "scan.h5")
+    shutil.copy(runner.folder / "pass.h5", runner.folder / "scan.h5")
 
 
 def correct_nothing(runner: Runner) -> None:
@@ -159,9 +176,10 @@ def photographs_with_description(runner: Runner) -> None:
 
 PAGES_RUN = {
     "README.md": Page(
-        given=THREE_VIEWS | {"after.cloud.h5": "pipe.cloud.h5", "before.cloud.h5": "pipe.cloud.h5"},
+        given=THREE_VIEWS
+        | {"after.cloud.h5": "pipe.cloud.h5", "before.cloud.h5": "pipe.cloud.h5", "small-set.toml": "small-set.toml"},
         small_python=True,
-        instead={"stripe-turbid --scenes 200": "stripe-clean --scenes 1"},
+        instead=A_SET,
         again=("twin simulate spheres",),
         not_run=MAKE | {"uwlts scan": HARDWARE, "uwlts desk": HARDWARE},
     ),
@@ -175,7 +193,7 @@ PAGES_RUN = {
     "docs/explanation/joint-calibration.md": Page(
         given={name: name for name in ("target-air.h5", "target-water.h5", "step-near.h5", "step-far.h5", "spheres.h5")}
         | {"pipe.h5": "pipe.h5", "plane.h5": "plane.h5", "target.h5": "target-water.h5", "today.h5": "today.h5"}
-        | {"step-today.h5": "step-today.h5", "last-year.json": "calibration.json"},
+        | {"step-today.h5": "step-today.h5", "last-year.json": "joint.json"},
         instead={"--limit-mm 0.05": "--limit-mm 0.5"},
         again=("uwlts calibrate --air", "uwlts calibrate --joint", "uwlts calibrate --water target.h5")
         + ("uwlts certificate calibration.json --before",),
@@ -188,9 +206,8 @@ PAGES_RUN = {
         instead={'kind: Literal["plain circles"] = "plain circles"': 'kind: Literal["plain"] = "plain"'}
     ),
     "docs/how-to/calibrate-a-mount.md": Page(
-        before=ROBOT.replace("mount.json", "robot-mount.json")
-        + "twin simulate robot-target --out board.h5\ncp robot.h5 scan.h5\n"
-        + "twin simulate vehicle-pipe --out vehicle.h5",
+        before=ROBOT,
+        given={name: name for name in ("pass.h5", "pass.trajectory.csv")},
         prepare={
             "uwlts mount profiles poses.csv": profiles_of_a_robot,
             "uwlts mount board.h5": poses_of_a_capture,
@@ -223,14 +240,15 @@ PAGES_RUN = {
     ),
     "docs/how-to/inspect-a-pipe.md": Page(
         given={name: name for name in ("pipe.cloud.h5", "pipe.h5", "weld.cloud.h5")}
-        | {"water.json": "calibration.json", "water.certificate.json": "certificate.json"}
+        | {"water.json": "joint.json", "water.certificate.json": "certificate.json"}
     ),
     "docs/how-to/large-clouds.md": Page(
         given={"scan.cloud.h5": "pipe.cloud.h5"}, instead={"1000 -50 300 1100 50 600": "-10 -50 0 10 50 30"}
     ),
     "docs/how-to/make-a-data-set.md": Page(
+        given={"small-set.toml": "small-set.toml"},
         tables={"mine.toml": 0},
-        instead={"stripe-turbid --scenes 200": "stripe-clean --scenes 1", "scenes = 40": "scenes = 2"},
+        instead=A_SET | {"scenes = 40": "scenes = 2"},
     ),
     "docs/how-to/recalibrate-by-passes.md": Page(not_run={"uwlts recalibrate": PASSES_ELSEWHERE}),
     "docs/how-to/register-scans.md": Page(given=THREE_VIEWS, texts={"start.csv": NO_MOVEMENT}),
@@ -264,11 +282,7 @@ assert table["near_mm"] >= 149.9 and table["line_mm"] >= 159.9
         figures="assert len(view.pixels) > 100 and abs(calibration.camera.fx_px - true.focal_length_px()) < 2.0",
     ),
     "docs/tutorials/learn-from-a-data-set.md": Page(
-        instead={
-            "scenes=12": "scenes=4",
-            'base = "stripe-turbid"': 'base = "stripe-clean"\nsensor = "thesis-small"\n'
-            "splits = { train = 0.8, test = 0.2, validation = 0 }",
-        }
+        instead={"scenes=12": "scenes=4", 'base = "stripe-turbid"': SMALL_SET}
     ),
     "docs/tutorials/photographs-to-cloud.md": Page(
         prepare={"uwlts import target": both_folders_of_the_page},
@@ -280,6 +294,7 @@ for figure in (evaluation.sphere_spacing, *evaluation.diameters):
     "docs/tutorials/photographs-to-sensor.md": Page(
         prepare={"uwlts camera photographs": photographs_with_description},
         instead={"Path.cwd().parents": "Path(uwlts.__file__).parents"},
+        # Halves of the photographs agree.
         figures="assert len(camera.lens.used) == 16 and apart < 3 * stated and turn < 3 * normals",
     ),
     "docs/tutorials/run-an-experiment.md": Page(instead={"SEEDS = range(3)": "SEEDS = range(1)"}),
@@ -306,11 +321,12 @@ def workers() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory, small: Path) -> Path:
+def shared(tmp_path_factory: pytest.TempPathFactory, small: Path) -> Campaign:
     folder = tmp_path_factory.mktemp("campaign")
-    runner = Runner(folder, small)
-    for line in CAMPAIGN.strip().splitlines():
-        runner.command(line)
+    without = 'title = "Small"\nwithout = ["multiple-scattering", "secondary-light"]'
+    (folder / "small-set.toml").write_text(without + SMALL_SET, encoding="utf-8")
+    campaign = Campaign(folder)
+    campaign.run(CAMPAIGN, small)
     drawn = trimesh.creation.cylinder(radius=150.0, height=200.0, sections=1000)
     drawn.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0], [0, 0, 0]))
     drawn.apply_translation([0.0, 0.0, 150.0])
@@ -320,7 +336,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory, small: Path) -> Path:
     for seed, side in enumerate(("left", "right")):
         noise = np.random.default_rng(seed).normal(0, 0.02, cloud.points_mm.shape)
         replace(cloud, points_mm=cloud.points_mm + noise).save(folder / f"{side}.cloud.h5")
-    return folder
+    return campaign
 
 
 def test_every_page_with_commands_is_run():

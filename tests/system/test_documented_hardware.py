@@ -7,7 +7,7 @@ import pytest
 
 from tests.documented import ROOT
 from tests.system.documented_runs import Page, Runner, run_page, write_small_descriptions
-from tests.system.test_calibrate_live import LATTICE, SENSOR
+from tests.system.test_desk_calibration import SENSOR
 from twin.devices.serve import ServedTwin, serve
 from twin.scene.description import load_scene
 
@@ -16,21 +16,6 @@ pytestmark = pytest.mark.slow
 CAMERA, STAGE = "gige:127.0.0.1", "/dev/stage"
 """The stage's pseudo terminal has another name each time: the served one takes the place of this."""
 ADDRESSES = {"gige:192.168.1.10": CAMERA, "/dev/ttyACM0": STAGE}
-LIVE_PLAN = f"""
-title = "Tank"
-sensor = "sensor.toml"
-poses = "stage-normal"
-[target]
-{LATTICE}
-[stage]
-first_mm = 90.0
-last_mm = 310.0
-count = 5
-feed_mm_per_min = 900.0
-home = true
-[wanted]
-fewest_images = 5
-"""
 
 
 def without_capture(runner: Runner) -> None:
@@ -64,12 +49,7 @@ PAGES_RUN = {
         texts={"tank/README": ""},
         ready={"twin serve spheres": "serving", "uwlts desk": "http"},
     ),
-    "docs/how-to/calibrate-live.md": Page(
-        texts={"sensor.toml": SENSOR, "plan.toml": LIVE_PLAN},
-        instead=ADDRESSES
-        | {"calibrate --live plan.toml": f"calibrate --live plan.toml --camera {CAMERA} --stage {STAGE}"},
-        again=("uwlts calibrate --live plan.toml --out calibration.json --resume",),
-    ),
+    "docs/how-to/calibrate-live.md": Page(texts={"tank/README": ""}, instead=ADDRESSES, ready={"uwlts desk": "http"}),
 }
 SERVED = {"docs/how-to/hardware-camera.md": "target", "docs/how-to/scan.md": "spheres"} | {
     "docs/how-to/calibrate-live.md": "target"

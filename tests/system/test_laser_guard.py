@@ -7,70 +7,83 @@ camera draws a stripe where the driver says that the laser is on, and hangs wher
 import os
 import re
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
+from tests import preloaded
+from tests.preloaded import Preloaded
 from tests.system.small_board import small_sensor
 from twin.devices.grbl_controller import GrblController
+from uwlts.desk import scan as scanning
+from uwlts.hardware.camera_interface import CameraDevice, CameraInfo, Delivered
+from uwlts.hardware.grbl import GrblStage
 from uwlts.storage.capture import Capture, part_path
 
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).resolve().parents[2]
 EXPOSURE_S = 0.5
 ALLOWED_S = EXPOSURE_S + 1.0
 LOAD_S = 0.5
 """Allowance for busy machines, where a ready process does not run at once. The guard itself needs some ms."""
 COUNT = 4
 
-PROGRAM = """
-import sys, time
-import numpy as np
-from uwlts import cli
-from uwlts.desk import scan as scanning
-from uwlts.hardware.camera_interface import CameraDevice, CameraInfo, Delivered
-from uwlts.hardware.grbl import GrblStage
-from uwlts.runtime import console
-
-hangs = sys.argv.pop(1)
 
 class Stage(GrblStage):
-    def __init__(self, port):
+    """The stage that was opened last is `opened`; ``hangs`` is where the camera's driver hangs."""
+
+    opened: "Stage"
+    hangs = ""
+
+    def __init__(self, port: str):
         super().__init__(port)
         Stage.opened = self
-    def laser(self, on, **how):
+
+    def laser(self, on: bool, **how: Any) -> None:
         super().laser(on, **how)
-        if not on and hangs == "lost":
+        if not on and self.hangs == "lost":
             # Dark for long enough to be seen from outside, before the next try.
             time.sleep(0.3)
 
+
 class Camera(CameraDevice):
-    number = 0
-    due_s = None
-    def _open(self): return CameraInfo("drawn", "1", 96, 512, 8)
-    def _configure(self, wanted): return wanted
-    def _close(self): pass
-    def _start(self): pass
-    def _stop(self): pass
-    def _check_answer(self): pass
-    def _trigger(self):
+    """Draws a stripe where the stage's driver says that the laser is on."""
+
+    number, due_s, lit = 0, None, False
+
+    def _open(self) -> CameraInfo:
+        return CameraInfo("drawn", "1", 96, 512, 8)
+
+    def _configure(self, wanted: Any) -> Any:
+        return wanted
+
+    def _close(self) -> None: ...
+
+    def _start(self) -> None: ...
+
+    def _stop(self) -> None: ...
+
+    def _check_answer(self) -> None: ...
+
+    def _trigger(self) -> None:
         self.lit = Stage.opened.laser_power > 0
         if self.lit:
             print("lit", Stage.opened._guard.pid, flush=True)
-        if self.lit and hangs == "trigger":
+        if self.lit and Stage.hangs == "trigger":
             time.sleep(60)
         self.due_s = time.monotonic() + 1e-3 * self.settings.exposure_ms
-    def _take_next(self, timeout_s):
-        if self.due_s is None: return None
-        if self.lit and hangs == "frame":
+
+    def _take_next(self, timeout_s: float) -> Delivered | None:
+        if self.due_s is None:
+            return None
+        if self.lit and Stage.hangs == "frame":
             time.sleep(60)
-        if hangs == "lost":
+        if Stage.hangs == "lost":
             time.sleep(timeout_s)
             return None
         time.sleep(min(timeout_s, max(self.due_s - time.monotonic(), 0)))
@@ -82,9 +95,12 @@ class Camera(CameraDevice):
             image[250:253] = [[90], [180], [90]]
         return Delivered(image, self.number)
 
-scanning.GrblStage, scanning.open_camera = Stage, Camera
-sys.exit(console.run(cli.app))
-"""
+
+def run_scan(hangs: str, *words: str) -> None:
+    """Run the command with this stage and camera, in a job of its own, as a shell starts it, in the same session."""
+    os.setpgid(0, 0)
+    Stage.hangs, scanning.GrblStage, scanning.open_camera = hangs, Stage, Camera
+    preloaded.run_uwlts(*words)
 
 
 @pytest.fixture
@@ -97,13 +113,12 @@ def controller() -> Iterator[GrblController]:
 class Scanning:
     """A running scan whose laser has just been switched on for an image, and its guard's process."""
 
-    program: subprocess.Popen[str]
+    program: Preloaded
     controller: GrblController
     out: Path
 
     def lit(self) -> int:
         """Wait for the next laser image; the guard's process."""
-        assert self.program.stdout is not None
         for line in self.program.stdout:
             if found := re.fullmatch(r"lit (\d+)\n", line):
                 assert self.controller.state().laser_on
@@ -143,22 +158,13 @@ def start(controller: GrblController, tmp_path: Path) -> Iterator[StartScan]:
         f"count = {COUNT}\nfeed_mm_per_min = 900.0\n",
         encoding="utf-8",
     )
-    running: list[subprocess.Popen[str]] = []
+    running: list[Preloaded] = []
 
     def scan(*more: str, hangs: str = "") -> Scanning:
         out = tmp_path / "scan.h5"
-        program = subprocess.Popen(
-            [sys.executable, "-c", PROGRAM, hangs, "scan", tmp_path / "plan.toml", "--out", out, "--home", *more],
-            cwd=ROOT,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            # A job of its own, as a shell starts it, in the session of this process.
-            process_group=0,
-        )
-        running.append(program)
-        return Scanning(program, controller, out)
+        words = ("scan", str(tmp_path / "plan.toml"), "--out", str(out), "--home", *more)
+        running.append(Preloaded(run_scan, hangs, *words))
+        return Scanning(running[-1], controller, out)
 
     yield scan
     for program in running:
@@ -275,5 +281,5 @@ def test_both_processes_may_be_asked_to_end_at_once(start):
     scan = start()
     guard = scan.lit()
     os.kill(guard, signal.SIGTERM)
-    scan.program.terminate()
+    scan.program.send_signal(signal.SIGTERM)
     print(f"dark after {scan.dark_after_s(at_most_s=0.0):.3f} s")

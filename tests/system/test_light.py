@@ -7,9 +7,6 @@ middle of a light, before its image is sent. The controller's own log says how l
 import os
 import re
 import signal
-import subprocess
-import sys
-import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -19,14 +16,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests import preloaded
+from tests.preloaded import Preloaded
 from tests.system.drawn_hardware import STAGE, DrawnCamera, write_plan
 from tests.waiting import within
 from twin.devices.gige_camera import ExposedFrame, GigeCamera
 from twin.devices.grbl_controller import GrblController
+from uwlts.hardware.grbl import GrblStage
 
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).resolve().parents[2]
 EXPOSURE_MS = 0.09
 ALLOWED_S = 1e-3 * EXPOSURE_MS + 1.0
 FAULTY_LIGHT = 4
@@ -60,16 +59,8 @@ class FaultyCamera(DrawnCamera):
 class Lit:
     """Program that switches the laser of a controller; signals can be sent to it and to its guard."""
 
-    def __init__(self, controller: GrblController, *words: object):
-        self.controller, self._sent = controller, []
-        self.program = subprocess.Popen(
-            [sys.executable, *map(str, words)],
-            cwd=ROOT,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+    def __init__(self, controller: GrblController, program: Preloaded):
+        self.controller, self.program, self._sent = controller, program, []
 
     def signal(self, number: int, *, guard: bool = False) -> None:
         """Send a signal to the program, after its guard, the only child, if that is to receive it, too."""
@@ -94,7 +85,7 @@ class Scan(Lit):
     """A running scan and its camera."""
 
     def __init__(self, camera: "FaultyCamera | FreeCamera", controller: GrblController, plan: Path):
-        super().__init__(controller, "-m", "uwlts", "scan", plan, "--out", plan.parent / "scan.h5", "--home")
+        super().__init__(controller, preloaded.uwlts("scan", plan, "--out", plan.parent / "scan.h5", "--home"))
         self.camera = camera
 
 
@@ -268,10 +259,9 @@ def dark_after_s(controller: GrblController, fault_s: float) -> float:
 # Light that is kept
 
 
-KEEPS = """
-    import sys, time
-    from uwlts.hardware.grbl import GrblStage
-    with GrblStage(sys.argv[1]) as stage:
+def keep_lit(port: str) -> None:
+    """Renew a light for ever."""
+    with GrblStage(port) as stage:
         stage.home()
         stage.laser(True)
         for _ in range(8):
@@ -281,15 +271,14 @@ KEEPS = """
         while True:
             time.sleep(0.25)
             stage.keep_lit()
-"""
 
 
 @pytest.mark.parametrize("fault", ["kill both", "stop both", "mute", "cut-line"])
 def test_light_that_is_kept_ends_within_a_second_of_its_last_renewal(fault):
     with GrblController(speed_up=50.0, boot_s=0.2) as controller:
-        keeping = Lit(controller, "-c", textwrap.dedent(KEEPS), controller.port)
+        keeping = Lit(controller, Preloaded(keep_lit, controller.port))
         try:
-            assert keeping.program.stdout is not None and keeping.program.stdout.readline() == "lit\n"
+            assert keeping.program.stdout.readline() == "lit\n"
             # It lasts, but for the ms between two dwells.
             assert controller.state().laser_on and sum(light.duration_s for light in controller.lights) > 1.5
             match fault:

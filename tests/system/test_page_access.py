@@ -14,7 +14,6 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, suppress
 from dataclasses import dataclass
 from itertools import product
-from pathlib import Path
 from urllib.parse import parse_qs, urlencode, urlsplit
 
 import numpy as np
@@ -23,11 +22,13 @@ from nicegui import ui
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
+from tests import preloaded
 from tests.waiting import within
 from uwlts.desk.access import MOST_VIEWERS, PageAccess
 from uwlts.desk.board_page import BoardView, update_regularly
 from uwlts.desk.guided import answer_buttons
 from uwlts.desk.guided_screen import BoardScreen
+from uwlts.desk.laser_switch import LaserSwitch
 from uwlts.desk.server import DeskServer
 from uwlts.desk.shown_state import Board, Picture
 from uwlts.errors import SetupError
@@ -56,7 +57,7 @@ class Page(Place):
 def guarded(title: str, **options: object) -> Page:
     """Serve such a page."""
     board = Board(title)
-    screen = BoardScreen(board)
+    screen = BoardScreen(board, LaserSwitch(board, lambda: screen.laser_off()))
 
     def build(shown: Board, operator: bool) -> None:
         view = BoardView(shown)
@@ -459,13 +460,7 @@ def test_the_desk_shows_bystanders_no_control_and_gives_out_nothing_but_its_fold
     (tmp_path / "outside.html").write_text("beyond the folder", encoding="utf-8")
     (folder / "link.html").symlink_to(tmp_path)
     (folder / "leak.html").symlink_to(tmp_path / "outside.html")
-    desk = subprocess.Popen(
-        [sys.executable, "-m", "uwlts", "desk", str(folder), "--port", "0"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        cwd=Path(__file__).resolve().parents[2],
-    )
+    desk = preloaded.uwlts("desk", folder, "--port", "0")
     try:
         line = desk.stdout.readline()
         operator, address = re.fullmatch(r"open (\S+) to work, (\S+) to look; Ctrl-C ends it\n", line).groups()

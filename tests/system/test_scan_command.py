@@ -3,7 +3,6 @@
 import re
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 
 import uwlts
+from tests import preloaded
 from tests.system import in_process
 from tests.system.small_board import small_sensor, turned_board
 from tests.waiting import within
@@ -24,7 +24,6 @@ from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture, part_path
 from uwlts.stripe import extract_stripe
 
-ROOT = Path(__file__).resolve().parents[2]
 COUNT = 6
 MOTION = ("start_mm = -5.0", "step_mm = 2.0", f"count = {COUNT}")
 DESCRIPTIONS = {
@@ -50,11 +49,6 @@ def written(folder: Path, served: ServedTwin, *, name: str = "plan", top: str = 
         encoding="utf-8",
     )
     return path
-
-
-def command(plan: Path, out: Path, *more: str) -> list[str]:
-    """The command as a process of its own."""
-    return [sys.executable, "-m", "uwlts", "scan", str(plan), "--out", str(out), "--home", *more]
 
 
 def run(plan: Path, out: Path, *more: str) -> subprocess.CompletedProcess[str]:
@@ -116,8 +110,7 @@ def test_automatic_exposure_comes_near_that_of_the_twin(served, folder, tmp_path
 
 def test_background_is_subtracted_and_lamp_images_are_kept(served, folder, tmp_path):
     top = 'background = true\nlights = ["lamp", "laser"]\nlaser_ms = 0.3\nlamp_ms = 0.3'
-    arguments = command(written(folder, served, top=top, count=2), tmp_path / "scan.h5")
-    done = subprocess.run(arguments, capture_output=True, text=True, timeout=120)
+    done = run(written(folder, served, top=top, count=2), tmp_path / "scan.h5")
     assert done.returncode == 0, done.stderr
     with Capture(tmp_path / "scan.h5") as scan:
         assert scan.laser_on.tolist() == [False, True, False, True]
@@ -133,7 +126,7 @@ def test_background_is_subtracted_and_lamp_images_are_kept(served, folder, tmp_p
 def test_an_interrupted_scan_is_dark_keeps_its_images_and_goes_on(served, folder, tmp_path):
     out = tmp_path / "scan.h5"
     plan = written(folder, served, top="laser_ms = 0.3", settle_s=0.4)
-    scanning = subprocess.Popen(command(plan, out), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    scanning = preloaded.uwlts("scan", plan, "--out", out, "--home")
     deadline = time.monotonic() + 60
     while True:
         assert time.monotonic() < deadline

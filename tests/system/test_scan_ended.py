@@ -8,8 +8,6 @@ import re
 import resource
 import shutil
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -19,6 +17,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests import preloaded
+from tests.preloaded import Preloaded
 from tests.system.drawn_hardware import STAGE, START_MM, DrawnCamera, write_plan
 from tests.system.in_process import uwlts
 from tests.waiting import within
@@ -27,9 +27,8 @@ from uwlts.storage.capture import Capture, part_path
 
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).resolve().parents[2]
 COUNT, STEP_MM = 6, 2.0
-MANY = 55
+MANY = 30
 """Images of a scan that is always ended from outside first."""
 LAST_MM = START_MM + STEP_MM * (COUNT - 1)
 
@@ -60,32 +59,17 @@ class Bench:
         """A scan's arguments: resumed where something is left of it."""
         return ["scan", str(plan), "--out", str(self.out), "--home", *(["--resume"] if self.kept() is not None else [])]
 
-    def start(self, plan: Path, *, largest_file: int | None = None) -> "subprocess.Popen[str]":
+    def start(self, plan: Path, *, largest_file: int | None = None) -> Preloaded:
         """A scan in a process of its own; ``largest_file`` in bytes stands for a disk that is full."""
-
-        def limit() -> None:
-            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-            # As in a terminal, where the tests themselves run by nohup or in a script's background.
-            for number in (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT):
-                signal.signal(number, signal.SIG_DFL)
-            if largest_file is not None:
-                resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
-
-        program = subprocess.Popen(
-            [sys.executable, "-m", "uwlts", *self.words(plan)],
-            cwd=ROOT,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-            preexec_fn=limit,
-        )
-        # Waits for its end and closes the pipe.
-        self._stack.enter_context(program)
+        if largest_file is None:
+            program = preloaded.uwlts(*self.words(plan))
+        else:
+            program = Preloaded(run_on_full_disk, str(largest_file), *self.words(plan))
+        self._stack.callback(program.communicate)
         self._stack.callback(program.kill)
         return program
 
-    def wait(self, program: "subprocess.Popen[str]", lights: int) -> None:
+    def wait(self, program: Preloaded, lights: int) -> None:
         """Wait until a running scan has taken this many further images with laser."""
         wanted = self.camera.lit + lights
         assert within(30.0, lambda: self.camera.lit >= wanted or program.poll() is not None)
@@ -128,6 +112,11 @@ class Bench:
             done = uwlts(*self.words(self.plan(count=count, **plan)))
             assert done.returncode == 0, done.stderr
         assert self._complete(self.out) == count and not part_path(self.out).exists()
+
+
+def run_on_full_disk(largest_file: str, *words: str) -> None:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(largest_file),) * 2)
+    preloaded.run_uwlts(*words)
 
 
 @pytest.fixture

@@ -32,6 +32,7 @@ GATES_MM = {
     (SPHERES, "polynomials", "SSE"): (-0.02, 0.02),
     (SPHERES, "single viewpoint", "SSE"): (-0.02, 0.02),
     (SPHERES, "one refraction, low pass", "STD"): (0.08, 0.10),
+    # Speckle limits the scatter of a plane: 0.025 mm at the stand-off, at contrast 0.71.
     (PLANE, "two refractions", "STD"): (0.020, 0.029),
     (PLANE, "two refractions", "RE, 99.7 %"): (0.10, 0.18),
 }
@@ -134,8 +135,7 @@ def imperfect(tmp_path_factory: pytest.TempPathFactory) -> FigureTable:
     described = load_campaign("thesis").model_dump(include={"title", "imperfections"}) | SENSORS
     places = ["near", "near-2", "standoff", "standoff-2", "far", "far-2"]
     scans = {"scene": "spheres", "media": ["water"], "placements": places}
-    plane = {"scene": "plane", "media": ["water"], "placements": ["standoff"]}
-    campaign = Campaign.model_validate(described | {"recordings": [*RECORDINGS[:4], scans, plane]})
+    campaign = Campaign.model_validate(described | {"recordings": [*RECORDINGS[:4], scans]})
     how = {"name": "imperfect", "methods": METHODS}
     out = tmp_path_factory.mktemp("imperfect")
     return run_experiment(campaign, out, range(1, 2), RecordingOptions(EVERY), **how).table
@@ -186,6 +186,3 @@ def test_the_joint_calibration_measures_closer_than_the_thesis_s_ways(imperfect:
 
     stating = {row.method for row in imperfect.rows if row.expanded_mm is not None}
     assert stating == {"joint, same evidence", "joint, with the target in water", JOINT}
-    # Speckle limits the scatter of a plane: 0.025 mm at the stand-off of the thesis's sensor, at contrast 0.71.
-    (scatter,) = imperfect.select(scan="plane-standoff-water", figure="STD").rows
-    assert 0.0 < scatter.measured_mm < 0.05

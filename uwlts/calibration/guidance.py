@@ -60,13 +60,12 @@ class Setting:
     medium: Medium
     poses: Poses
     approaching: bool = True
-    camera: CameraOptions = CameraOptions()
 
     def intrinsics(self) -> Intrinsics:
         """Return the camera parameters that are estimated."""
         camera = self.sensor.camera
         return Intrinsics(
-            self.camera.with_described_pixels(camera), width_px=camera.width_px, height_px=camera.height_px
+            CameraOptions().with_described_pixels(camera), width_px=camera.width_px, height_px=camera.height_px
         )
 
 
@@ -288,7 +287,6 @@ def solve_state(recorded: Sequence[RecordedPose], setting: Setting, wanted: Comp
                 height_px=image.height_px,
                 poses=setting.poses,
                 approaching=setting.approaching,
-                options=setting.camera,
                 circle_diameter_mm=setting.target.circle_diameter_mm,
             )
             camera, undetermined = solution.model, ""

@@ -21,63 +21,19 @@ from uwlts.cli.command_options import (
 from uwlts.errors import DescriptionError, OutputError
 from uwlts.runtime.command_line import Call, command_from, say, show, warn
 
-_EVIDENCE = ("air", "water", "step", "scan")
 
-
-@command_from(app, uwlts, "calibrate", job="Calibrate", also=[(uwlts.desk, "record_guided")], shortcuts=STRIPE)
-def calibrate(
-    call: Call,
-    *,
-    out: CalibrationOut,
-    live: Annotated[
-        Path | None,
-        Parameter(
-            help="Plan (TOML; docs: calibrate live) of a guided calibration with camera and stage, instead "
-            "of captures: leads through the images, rejects bad ones with the reason, and records the good ones beside "
-            "the calibration."
-        ),
-    ] = None,
-    camera=None,
-    stage=None,
-    port=8080,
-    resume=False,
-    overwrite=False,
-) -> None:
+@command_from(app, uwlts, "calibrate", job="Calibrate", shortcuts=STRIPE)
+def calibrate(call: Call, *, out: CalibrationOut, overwrite: Overwrite = False) -> None:
     """Example: uwlts calibrate --air target.h5 --step step-near.h5 step-far.h5 --out calibration.json
 
     Example: uwlts calibrate --water target-water.h5 --out calibration.json
 
     Example: uwlts calibrate --calibration calibration.json --step step-today.h5 --new-water --out today.json
     """
-    from uwlts.calibration.camera.lens import require_coefficients
     from uwlts.calibration.joint.next_shot import advice_lines
-    from uwlts.optics.window import require_index
     from uwlts.report.file_description import calibration_lines
 
-    recorded = {}
-    if live is not None:
-        if any(call.given.get(name) for name in _EVIDENCE):
-            raise DescriptionError("`live` records its own captures: give either it, or `air`, `water` and `step`")
-        if (index := call.given.get("index")) is not None:
-            require_index(index)
-        wanted = call.given.get("distortion", "auto")
-        require_coefficients(wanted)
-        recording = uwlts.desk.record_guided(
-            live,
-            out,
-            camera=camera,
-            stage=stage,
-            port=port,
-            refractions=call.given.get("refractions", 2),
-            distortion=("k1", "k2") if wanted == "auto" else wanted,
-            resume=resume,
-            overwrite=overwrite,
-            report=say,
-        )
-        warn(*(f"still missing: {line}; --resume takes more images" for line in recording.missing))
-        recorded = {name: getattr(recording, name) for name in ("air", "water", "step")}
-        recorded["target_poses"] = recording.poses
-    calibration = call(**recorded)
+    calibration = call()
     advice = [] if calibration.joint is None else advice_lines(calibration)
     calibration.save(out, overwrite=overwrite)
     wrote([*calibration_lines(calibration), *advice], calibration.origin().warnings, out)

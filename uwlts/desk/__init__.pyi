@@ -1,3 +1,2 @@
-from .guided import record_guided as record_guided
 from .operator_page import serve_desk as serve_desk
 from .scan import serve_ros as serve_ros

@@ -5,26 +5,21 @@ are kept and the laser goes off.
 """
 
 import os
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from nicegui import ui
 
-from uwlts.calibration.camera.camera_parameters import CameraOptions
 from uwlts.calibration.camera.target_poses import Poses
 from uwlts.calibration.guidance import PLACES, Setting, State, next_depth_mm, select_separate_depths
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, calibrate_sequentially
-from uwlts.desk.board_page import BoardView, update_regularly
 from uwlts.desk.guided_phases import Session, StepPhase, TargetPhase, list_missing
-from uwlts.desk.guided_plan import GuidedPlan, GuidedStage, load_guided_plan
+from uwlts.desk.guided_plan import GuidedPlan, GuidedStage
 from uwlts.desk.guided_screen import ANSWERS, BoardScreen
-from uwlts.desk.server import DeskServer
 from uwlts.desk.shown_state import Board
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.rig import HandSwitchedLaser, LaserStage, Rig, add_provenance
@@ -45,27 +40,31 @@ class GuidedRecording:
     missing: tuple[str, ...]
 
 
-def guide(
-    plan: GuidedPlan,
-    out: Path,
-    screen: BoardScreen,
-    *,
-    refractions: Literal[1, 2] = 2,
-    distortion: tuple[str, ...] = ("k1", "k2"),
-    resume: bool,
-    overwrite: bool,
-) -> GuidedRecording:
-    """Lead through the images of a calibration on a screen; parameters and errors as `uwlts.desk.record_guided`."""
-    options = CalibrationOptions(refractions=refractions, poses=plan.poses, camera=CameraOptions(distortion=distortion))
-    setting = replace(plan.setting(), camera=options.camera)
-    phases = _Phases(plan, setting, plan.camera_address(), screen, resume, overwrite and not resume)
+def guide(plan: GuidedPlan, out: Path, screen: BoardScreen, *, resume: bool, overwrite: bool) -> GuidedRecording:
+    """Lead through the images of a calibration on a screen, and record accepted images in captures beside it.
+
+    The captures have the name ``out`` of the calibration with ``-target.h5`` and ``-step.h5``. ``resume`` continues
+    an earlier recording, also a finished capture that does not suffice. ``overwrite`` replaces captures otherwise.
+
+    Raises
+    ------
+    DescriptionError, RangeError
+        The plan cannot be carried out; nothing has moved.
+    HardwareError
+        Camera, stage or laser fail.
+    CalibrationError
+        The target does not determine a calibration to judge the step standard.
+    OutputError
+        A capture exists, or cannot be written.
+    """
+    phases = _Phases(plan, plan.setting(), plan.camera_address(), screen, resume, overwrite and not resume)
     target, step = (out.with_name(f"{out.stem}-{shown}.h5") for shown in ("target", "step"))
     missing = list_missing(phases.target(target))
     if plan.step is not None:
         with Capture(target) as capture:
-            known = calibrate_sequentially([capture], (), options=options).calibration
+            known = calibrate_sequentially([capture], (), options=CalibrationOptions(poses=plan.poses)).calibration
         sensor = plan.described_sensor()
-        window = WindowModel.from_description(sensor.camera.window, sensor.laser.wavelength_nm, refractions=refractions)
+        window = WindowModel.from_description(sensor.camera.window, sensor.laser.wavelength_nm, refractions=2)
         missing += phases.step(step, StepPhase(plan.step, sensor, known, window))
     return GuidedRecording(
         air=(target,) if plan.target_in_air() else (),
@@ -176,86 +175,3 @@ def answer_buttons(board: Board, press: Callable[[str], None]) -> Callable[[], N
         asked.set_visibility(bool(board.request))
 
     return refresh
-
-
-def record_guided(
-    plan: str | Path | GuidedPlan,
-    out: str | Path,
-    *,
-    camera: str | None = None,
-    stage: str | None = None,
-    port: int = 8080,
-    refractions: Literal[1, 2] = 2,
-    distortion: tuple[str, ...] = ("k1", "k2"),
-    resume: bool = False,
-    overwrite: bool = False,
-    report: Callable[[str], None] = print,
-) -> GuidedRecording:
-    """Lead through the images of a calibration, and record accepted images in captures beside the calibration.
-
-    Parameters
-    ----------
-    plan : GuidedPlan or path of a TOML file
-        Description of the recording and its devices (docs: calibrate live).
-    out : str or Path
-        The calibration; the captures have its name with ``-target.h5`` and ``-step.h5``.
-    camera : str, optional
-        Guided: address of the camera, instead of the plan's.
-    stage : str, optional
-        Guided: serial port of the stage, instead of the plan's.
-    port : int
-        Guided: port of the page for the browser; if it is in use, the next free one is taken.
-    refractions, distortion
-        Options of the calibration that is to be made; see `calibrate`.
-    resume : bool
-        Guided: continue an earlier recording, also a finished capture of the target that does not suffice.
-    overwrite : bool
-        Replace existing files; guided, and without ``resume``, earlier captures too.
-    report : callable, optional
-        Called with lines of text for the operator, who answers on standard input or on the page.
-
-    Returns
-    -------
-    GuidedRecording
-        Captures of target and step standard, the kind of poses, and the evidence that is still missing.
-
-    Raises
-    ------
-    DescriptionError, RangeError
-        The plan cannot be carried out; nothing has moved.
-    HardwareError
-        Camera, stage or laser fail.
-    CalibrationError
-        The target does not determine a calibration to judge the step standard.
-    OutputError
-        A capture exists, or cannot be written.
-    """
-    described = plan if isinstance(plan, GuidedPlan) else load_guided_plan(Path(plan))
-    described = described.with_connection(camera=camera, port=stage)
-    described.camera_address()
-    board = Board(described.title)
-    board.phase("guided calibration")
-    screen = BoardScreen(board, say=report, answers=sys.stdin.fileno())
-
-    def build(board: Board, operator: bool) -> None:
-        view = BoardView(board)
-        view.header()
-        with ui.element("main").classes("desk guided"):
-            view.image()
-            with ui.element("section").classes("cloud"):
-                refresh = answer_buttons(board, screen.press) if operator else lambda: None
-                view.coverage()
-            view.log()
-        update_regularly(lambda: (view.refresh(), refresh()))
-
-    with DeskServer(board, build=build, port=port, switch=screen.switch) as server:
-        report(f"open {server.operator_address}; Ctrl-C ends it, accepted images are kept")
-        return guide(
-            described,
-            Path(out),
-            screen,
-            refractions=refractions,
-            distortion=distortion,
-            resume=resume,
-            overwrite=overwrite,
-        )

@@ -349,7 +349,7 @@ class TargetPhase:
             if found.laser is not None:
                 self._session.record(*found.laser, stage_mm=stage_mm, laser_on=True)
         line = f"{name}: {found.line()}"
-        self._session.screen.report(line)
+        self._session.screen.say(line)
         points = None if found.view is None else found.view.pixels
         self._session.show(found.image, line, points=points, stripe=stripe)
         self._show_state(state)
@@ -430,7 +430,7 @@ class StepPhase:
             line = f"refused: {'; '.join(reasons)}"
         else:
             line = f"stripe on {len(quality.pixels)} lines, {depth_mm:.0f} mm outside the window"
-        session.screen.report(f"step: {line}")
+        session.screen.say(f"step: {line}")
         session.show(image, line, stripe=quality.pixels)
         if reasons or depth_mm is None:
             return None

@@ -108,9 +108,11 @@ class GuidedPlan(RigPlan):
     def camera_address(self) -> str:
         """Return the camera's address; raises DescriptionError if it, or the port of a planned stage, is missing."""
         if self.camera is None:
-            raise DescriptionError("the plan names no camera: give `camera`")
+            raise DescriptionError("the plan names no camera: add `camera`, or give the address under Connect")
         if self.stage is not None and self.stage.port is None:
-            raise DescriptionError("the plan names no serial port of the stage: give `stage`")
+            raise DescriptionError(
+                "the plan names no serial port of the stage: add `port`, or give the address under Connect"
+            )
         return self.camera
 
     def target_in_air(self) -> bool:

@@ -1,8 +1,6 @@
-"""Dialogue with the operator of a guided calibration: text, answers by Enter, words or buttons, and a board."""
+"""Dialogue with the operator of a guided calibration: text and answers on the board."""
 
-import os
 import queue
-import select
 import time
 from collections.abc import Callable
 
@@ -24,24 +22,12 @@ _MAP_CELL_PX = 48  # size of a cell of the map on the screen
 
 
 class BoardScreen:
-    """Display of a guided calibration on a board, and its answers; makes a ``switch`` if none is given.
+    """Display of a guided calibration on a board, and the operator's answers by its buttons."""
 
-    ``say`` is called with every line of text, by default that of the board's log. Answers come from buttons and, one
-    per line, from the file descriptor ``answers``, if given: an empty line for "take", or one of `ANSWERS`.
-    """
-
-    def __init__(
-        self,
-        board: Board,
-        switch: LaserSwitch | None = None,
-        *,
-        say: Callable[[str], None] | None = None,
-        answers: int | None = None,
-    ):
-        self._board, self.switch = board, switch or LaserSwitch(board, self.laser_off)
-        self.say, self._answers = say or board.say, answers
+    def __init__(self, board: Board, switch: LaserSwitch):
+        self._board, self.switch, self.say = board, switch, board.say
         self._given: queue.SimpleQueue[str] = queue.SimpleQueue()
-        self._typed, self._hint = b"", ""
+        self._hint = ""
         self._stage: LaserStage | None = None
         self._ending = self._darkened = False
 
@@ -71,28 +57,11 @@ class BoardScreen:
         if self._darkened:
             # Images of a hand-held target do not need the stage, whose fault would end the recording later.
             raise HardwareError("the laser was switched off by hand, which ends the calibration: continue it later")
-        if not self._given.empty():
-            return self._given.get()
-        # sys.stdin would block, and a blocked thread would keep the program from ending.
-        while self._answers is not None and select.select([self._answers], [], [], 0)[0]:
-            piece = os.read(self._answers, 4096)
-            if not piece:
-                # No terminal: only the buttons remain.
-                self._answers = None
-            self._typed += piece
-        line, end, rest = self._typed.partition(b"\n")
-        if not end:
-            return None
-        self._typed = rest
-        word = line.decode(errors="replace").strip().lower() or "take"
-        if word not in ANSWERS:
-            self.say(f"'{word}' is not understood: press Enter to take it, or type skip or done")
-            return None
-        return word
+        return None if self._given.empty() else self._given.get()
 
     def wait(self, request: str, meanwhile: Callable[[], None] = lambda: time.sleep(_LOOK_S)) -> str:
         """Output a request and wait for the answer."""
-        self.say(f"{request}; then press Enter")
+        self.say(f"{request}; then press take")
         while (answer := self.answer()) is None:
             meanwhile()
         return answer
@@ -102,12 +71,6 @@ class BoardScreen:
         if line != self._hint:
             self._hint = line
             self.say(line)
-
-    def report(self, line: str) -> None:
-        """Output a line about an image, also in the board's log."""
-        self.say(line)
-        if self.say != self._board.say:
-            self._board.say(line)
 
     def request(self, text: str) -> None:
         """Show what the operator should do."""

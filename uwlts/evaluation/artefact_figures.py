@@ -86,7 +86,9 @@ def evaluate_spheres(points: np.ndarray, artefact: SphereStandard) -> SphereEval
     deviation, labels = np.full(len(points), np.nan), np.full(len(points), -1)
     spheres, fits = [], []
     for sphere, diameter in zip(found, artefact.diameters_mm, strict=True):
-        members, robust = _fit_cap(points, sphere, artefact.cap_angle_deg)
+        members, robust = sphere.members, sphere.robust
+        if artefact.cap_angle_deg is not None:
+            members, robust = _fit_cap(points, sphere, artefact.cap_angle_deg)
         used, fit = members[robust.inliers], robust.fit
         if np.mean((points[used] - fit.centre_mm) @ TOWARDS_SENSOR) < 0:
             raise EvaluationError(
@@ -162,11 +164,7 @@ def _sort_spheres(found: list[FoundSphere], artefact: SphereStandard) -> list[Fo
     return [found[position] for position in orders[best]]
 
 
-def _fit_cap(
-    points: np.ndarray, sphere: FoundSphere, cap_angle_deg: float | None
-) -> tuple[np.ndarray, RobustFit[Sphere]]:
-    if cap_angle_deg is None:
-        return sphere.members, sphere.robust
+def _fit_cap(points: np.ndarray, sphere: FoundSphere, cap_angle_deg: float) -> tuple[np.ndarray, RobustFit[Sphere]]:
     offset = points[sphere.members] - sphere.robust.fit.centre_mm
     cosine = offset @ TOWARDS_SENSOR / np.linalg.norm(offset, axis=1)
     members = sphere.members[cosine >= np.cos(np.radians(cap_angle_deg))]

@@ -135,7 +135,18 @@ def figure_keys(artefact: Artefact) -> tuple[FigureKey, ...]:
     errors, plain = [], ()
     match artefact:
         case SphereStandard():
-            return _list_sphere_keys(artefact)
+            keys = [FigureKey(quantity, str(quantity)) for quantity in (Quantity.PROBING_ERROR, Quantity.STD)]
+            for number, diameter in enumerate(artefact.diameters_mm, start=1):
+                known = CalibratedQuantity(f"diameter, sphere {number}", diameter, artefact.diameter_uncertainty_mm)
+                own = (Quantity.PROBING_ERROR, None), (Quantity.STD, None), (Quantity.DIAMETER_ERROR, known)
+                keys += [FigureKey(quantity, f"{quantity} sphere {number}", (number,), size) for quantity, size in own]
+            for number, spacing in enumerate(artefact.spacings_mm, start=1):
+                pair = "" if len(artefact.spacings_mm) == 1 else f" {number}-{number + 1}"
+                for quantity in (Quantity.SPACING_ERROR, Quantity.SPACING_ERROR_KNOWN_RADIUS):
+                    named = f"{pair}{str(quantity).removeprefix('SSE')}"
+                    known = CalibratedQuantity(f"sphere spacing{named}", spacing, artefact.spacing_uncertainty_mm)
+                    keys.append(FigureKey(quantity, f"SSE{named}", (number, number + 1), known))
+            return tuple(keys)
         case PlaneStandard():
             plain = Quantity.RANGE_ERROR, Quantity.STD
         case StepStandard():
@@ -148,20 +159,6 @@ def figure_keys(artefact: Artefact) -> tuple[FigureKey, ...]:
             assert_never(artefact)
     with_errors = [*errors, *((quantity, None) for quantity in plain)]
     return tuple(FigureKey(quantity, str(quantity), calibrated=known) for quantity, known in with_errors)
-
-
-def _list_sphere_keys(artefact: SphereStandard) -> tuple[FigureKey, ...]:
-    keys = [FigureKey(quantity, str(quantity)) for quantity in (Quantity.PROBING_ERROR, Quantity.STD)]
-    for number, diameter in enumerate(artefact.diameters_mm, start=1):
-        known = CalibratedQuantity(f"diameter, sphere {number}", diameter, artefact.diameter_uncertainty_mm)
-        of_sphere = (Quantity.PROBING_ERROR, None), (Quantity.STD, None), (Quantity.DIAMETER_ERROR, known)
-        keys += [FigureKey(quantity, f"{quantity} sphere {number}", (number,), size) for quantity, size in of_sphere]
-    for number, spacing in enumerate(artefact.spacings_mm, start=1):
-        pair = "" if len(artefact.spacings_mm) == 1 else f" {number}-{number + 1}"
-        for quantity, suffix in ((Quantity.SPACING_ERROR, ""), (Quantity.SPACING_ERROR_KNOWN_RADIUS, " known radius")):
-            known = CalibratedQuantity(f"sphere spacing{pair}{suffix}", spacing, artefact.spacing_uncertainty_mm)
-            keys.append(FigureKey(quantity, f"SSE{pair}{suffix}", (number, number + 1), known))
-    return tuple(keys)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -194,12 +191,6 @@ class ArtefactEvaluation:
         """True if the rejected fraction is at most 0.3 %, the limit of VDI/VDE 2634."""
         return self.rejected_share <= VDI_OUTLIER_SHARE
 
-    @property
-    def vdi_range_mm(self) -> float:
-        """Range of the deviations without the 0.3 % of the points with the largest ones, as VDI/VDE 2634 allows."""
-        used = self.deviation_mm[np.isfinite(self.deviation_mm)]
-        return float(np.ptp(used[np.argsort(np.abs(used))[: len(used) - int(VDI_OUTLIER_SHARE * len(used))]]))
-
     def part_of(self, spheres: tuple[int, ...]) -> object:
         """Return the result that has the figures of one sphere or of two; the evaluation itself without any."""
         return self
@@ -221,13 +212,16 @@ class ArtefactEvaluation:
         extra = [
             field.name for field in dataclasses.fields(self) if field.name not in ("artefact", "deviation_mm", "labels")
         ]
+        used = self.deviation_mm[np.isfinite(self.deviation_mm)]
+        # VDI/VDE 2634 allows to leave out 0.3 % of the points, those with the largest deviations.
+        kept = used[np.argsort(np.abs(used))[: len(used) - int(VDI_OUTLIER_SHARE * len(used))]]
         return {
             "kind": self.artefact.kind,
             "figures_mm": self.figures_mm,
             "points_total": self.points_total,
             **{name: to_jsonable_python(getattr(self, name)) for name in extra},
             "rejected_share": self.rejected_share,
-            "vdi_range_mm": self.vdi_range_mm,
+            "vdi_range_mm": float(np.ptp(kept)),
             "within_vdi_outliers": self.within_vdi_outliers,
         }
 

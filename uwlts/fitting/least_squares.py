@@ -169,7 +169,7 @@ class Normalised:
     """Points (N, D) for a fit, as given and normalised to zero mean and unit rms distance.
 
     ``extents`` (D,) are the root sums of squares of the normalised points along their principal ``axes`` (rows of
-    (D, D)), in descending order.
+    (D, D)), in descending order. ``rank`` counts the directions that they span beyond rounding errors.
     """
 
     given_mm: np.ndarray
@@ -178,10 +178,7 @@ class Normalised:
     scale_mm: float
     extents: np.ndarray
     axes: np.ndarray
-
-    def is_flat(self, dimension: int) -> bool:
-        """Check whether the points span no more than ``dimension`` directions."""
-        return bool(self.extents[dimension] <= _SINGULAR * self.extents[0])
+    rank: int
 
 
 def normalise_points(points: Any, *, least: int, what: str, dimensions: tuple[int, ...] = (3,)) -> Normalised:
@@ -189,10 +186,12 @@ def normalise_points(points: Any, *, least: int, what: str, dimensions: tuple[in
     points = check_points(points, least=least, what=what, dimensions=dimensions)
     centroid = points.mean(axis=0)
     centred = points - centroid
-    scale = rms_distance(points, centroid)
+    scale = float(np.sqrt(np.mean(np.sum(centred**2, axis=1))))
     if scale <= 1e-12 * float(np.abs(centroid).max()):
         raise EvaluationError(f"{what}: all {len(points)} points coincide")
-    return Normalised(points, centred / scale, centroid, scale, *principal_axes(centred / scale))
+    extents, axes = principal_axes(centred / scale)
+    rank = int(np.count_nonzero(extents > _SINGULAR * extents[0]))
+    return Normalised(points, centred / scale, centroid, scale, extents, axes, rank)
 
 
 def rms_distance(points: np.ndarray, centre: np.ndarray) -> float:

@@ -64,7 +64,7 @@ class Plane(Flat):
         than 4 points, points that are not finite, or points on one line.
         """
         unit = normalise_points(points, least=4, what="a plane fit")
-        if unit.is_flat(1):
+        if unit.rank < 2:
             raise EvaluationError(f"a plane fit: all {len(unit.points)} points lie on one line")
         return cls._make_from_axes(unit, unit.axes[:2], _orient(unit.axes[2], towards)[None])
 
@@ -180,7 +180,7 @@ def prepare_round(points: Any, radius_mm: float | None, *, least: int, what: str
     unit = normalise_points(points, least=least if radius_mm is None else least - 1, what=what)
     if radius_mm is not None and not (np.isfinite(radius_mm) and radius_mm > 0):
         raise ValueError(f"the radius is {radius_mm}; expected a positive number")
-    if unit.is_flat(2):
+    if unit.rank < 3:
         raise EvaluationError(f"{what}: all {len(unit.points)} points lie in one plane")
     return unit, None if radius_mm is None else radius_mm / unit.scale_mm
 

@@ -212,11 +212,6 @@ class PointCloud(Brief):
                     raise CaptureError(f"`{name}` of a cloud needs an array of numbers: {error}") from error
                 column.flags.writeable = False
                 object.__setattr__(self, name, column)
-        self._require_shapes()
-        metadata_json(self.metadata)
-
-    def _require_shapes(self) -> None:
-        """Raise CaptureError if columns have other shapes than the points, or values are not usable."""
         points = self.points_mm
         if points.ndim != 2 or points.shape[1] != 3:
             raise CaptureError(f"the points of a cloud have the shape (N, 3), not {points.shape}")
@@ -235,6 +230,7 @@ class PointCloud(Brief):
             if shapes != ((len(points), 6), points.shape, points.shape) or by_pose not in (None, points.shape):
                 raise CaptureError(f"the uncertainty of {len(points)} points has the shapes {shapes}")
             _require_sound(known)
+        metadata_json(self.metadata)
 
     def __len__(self) -> int:
         return len(self.points_mm)

@@ -192,8 +192,10 @@ def load_cloud(cloud: PointCloud | str | os.PathLike[str], *, unit: Unit | None 
     found, warnings = omit_repeated(cloud if isinstance(cloud, PointCloud) else read_cloud(cloud, unit=unit))
     if found.random_std_mm is not None and found.uncertainty is None and _LEAN not in found.warnings:
         warnings.append(_LEAN)
+    if not warnings:
+        return found
     log_warnings("cloud" if isinstance(cloud, PointCloud) else cloud, warnings)
-    return replace(found, warnings=[*found.warnings, *warnings]) if warnings else found
+    return replace(found, warnings=[*found.warnings, *warnings])
 
 
 def read_thinned_cloud(
@@ -286,10 +288,11 @@ def _name_errors(path: str | os.PathLike[str]) -> Iterator[None]:
 
 def _read_rows(path: Path, rows: _Rows, unit: Unit | None) -> tuple[PointCloud, int]:
     """Read selected rows of a file, and the number of all; ``rows`` selects them by that number."""
-    if _is_hdf5(path):
+    ending = path.suffix.lower()
+    if ending == ".h5":
         _refuse_other_unit(path, unit)
         return _read_hdf5(path, rows)
-    if path.suffix.lower() != ".ply":
+    if ending != ".ply":
         with open_regular(path, called="cloud") as file:
             if not file.read(4).startswith(b"ply"):
                 raise CaptureError(f"{path} ends with none of {', '.join(CLOUD_ENDINGS)}, the formats of clouds")
@@ -445,10 +448,7 @@ def _read_ply(path: Path, rows: _Rows, unit: Unit | None) -> tuple[PointCloud, i
     chosen, warnings = omit_points(points, {})
     points, vertices = points[chosen], vertices[chosen]
     uncertainty = _read_uncertainty(known, lambda name: column(name, np.nan))
-
-    def lean(name: str) -> np.ndarray | None:
-        return column(name, np.nan) if name in known and uncertainty is None else None
-
+    lean = [name for name in ("random_std", "common_std") if name in known and uncertainty is None]
     deviation = column("deviation", np.nan)
     metadata, uncertainty = _split_shared(_read_metadata(comments), uncertainty)
     named, doubts = "mm", list[str]()
@@ -465,10 +465,9 @@ def _read_ply(path: Path, rows: _Rows, unit: Unit | None) -> tuple[PointCloud, i
         deviation_mm=None if np.isnan(deviation).all() else deviation,
         uncertainty=uncertainty,
         time_s=column("time", np.nan, np.float64) if "time" in known else None,
-        random_std_mm=lean("random_std"),
-        common_std_mm=lean("common_std"),
         metadata=metadata,
         warnings=[*doubts, *warnings],
+        **{f"{name}_mm": column(name, np.nan) for name in lean},
     )
     return note_step(cloud, scale * find_float_step(points)), len(whole)
 

@@ -83,8 +83,7 @@ def _fault(path: Path, what: str) -> CaptureError:
     return CaptureError(f"{path} is not a complete PLY file: {what}")
 
 
-def _split_header(path: Path, *, called: str) -> tuple[bytes, int, int]:
-    """Return the header, its length with the line of its end, and the size of the file."""
+def _read_header(path: Path, *, called: str) -> _Header:
     with open_regular(path, called=called) as file:
         start, size = file.read(_LONGEST_HEADER), os.fstat(file.fileno()).st_size
     text, end, rest = start.partition(b"end_header")
@@ -95,11 +94,6 @@ def _split_header(path: Path, *, called: str) -> tuple[bytes, int, int]:
     newline = b"\n" if text.startswith(b"ply\n") else b"\r\n" if text.startswith(b"ply\r\n") else b"\r"
     if not rest.startswith(newline):
         raise _fault(path, "early end-of-file, or other characters after end_header")
-    return text, len(text) + len(end) + len(newline), size
-
-
-def _read_header(path: Path, *, called: str) -> _Header:
-    text, used, size = _split_header(path, called=called)
     order, elements, comments = "", {}, []
     count, properties = 0, []
     for line in text.translate(_IN_ASCII).decode("ascii").splitlines()[1:]:
@@ -122,7 +116,7 @@ def _read_header(path: Path, *, called: str) -> _Header:
     if not order:
         raise _fault(path, "its header names no format")
     _require_complete(elements, size, path, ascii_text=order == "ascii")
-    return _Header(order == "ascii", _ORDERS[order], elements, comments, used)
+    return _Header(order == "ascii", _ORDERS[order], elements, comments, len(text) + len(end) + len(newline))
 
 
 def _require_complete(

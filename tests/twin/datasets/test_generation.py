@@ -65,11 +65,9 @@ def hashes(folder: Path) -> dict[str, str]:
     return {path.name: hash_file(path) for path in sorted(folder.glob("*.tar"))}
 
 
-@pytest.mark.slow
-def test_files_are_the_same_for_any_number_of_workers(folder, tmp_path):
+def test_another_seed_makes_other_files(folder, tmp_path):
     made = hashes(folder)
     assert len(made) >= 4
-    assert hashes(twin.dataset(small(), out=tmp_path / "two", workers=2)) == made
     other = hashes(twin.dataset(small(scenes=2), out=tmp_path / "seed", seed=1, workers=1))
     assert not set(other.values()) & set(made.values())
 
@@ -307,7 +305,9 @@ def test_memory_does_not_grow_with_the_number_of_frames(tmp_path):
 def test_presets_are_rendered(name, tmp_path):
     coarse = {"camera": {"width_px": 320, "height_px": 256, "pixel_size_um": 21.2}}
     table = load_description(name).model_dump(exclude_unset=True) | {"sensor": altered(load_sensor("thesis"), coarse)}
-    described = DataSetDescription.model_validate(table)
+    # Two of its frames show all lights and labels.
+    motion = table["motion"] | {"count": min(table["motion"]["count"], 2)}
+    described = DataSetDescription.model_validate(table | {"motion": motion, "spp": 4})
     samples = twin.load_dataset(twin.dataset(described, out=tmp_path / name, scenes=1, workers=1))
     for sample in samples:
         assert sample["image"].max() > 10 or sample["info"]["exposure_ms"] > 0
@@ -319,6 +319,7 @@ def test_presets_are_rendered(name, tmp_path):
 
 @pytest.mark.slow
 def test_runs_that_share_a_folder_make_the_same_files(folder, tmp_path):
+    """Files are the same for any number of workers, also of two runs at once."""
     with ThreadPoolExecutor(2) as runs:
         made = [runs.submit(twin.dataset, small(), out=tmp_path / "shared", workers=2) for _ in range(2)]
     assert {each.result() for each in made} == {tmp_path / "shared"}

@@ -82,17 +82,23 @@ def test_lattice_is_even_along_either_side(count):
         assert np.hypot(across, along).min() > 0.33 / math.sqrt(count)
 
 
-def test_faint_side_lobes_take_fewer_samples(thesis, monkeypatch):
-    changes = {"laser": {"waist_radius_mm": 0.4, "side_lobes": ((0.0, 30.0, 0.1),)}}
-    scene = scene_of(plate(), block((40.0, 6.0, 12.0), (0.0, 0.0, -6.0), reflectance=0.5))
-    sensor, images, rendered = altered(cropped(thesis, 160, 160), changes), [], []
-    whole = PixelSampler.render
+@pytest.fixture
+def rendered(monkeypatch) -> list[int]:
+    """Samples of what is rendered; the last number counts on."""
+    counts, whole = list[int](), PixelSampler.render
 
     def counted(self: PixelSampler, *arguments: Any, spp: int, **kwargs: Any) -> np.ndarray:
-        rendered[-1] += len(arguments[2]) * spp
+        counts[-1] += len(arguments[2]) * spp
         return whole(self, *arguments, spp=spp, **kwargs)
 
     monkeypatch.setattr(PixelSampler, "render", counted)
+    return counts
+
+
+def test_faint_side_lobes_take_fewer_samples(thesis, monkeypatch, rendered):
+    changes = {"laser": {"waist_radius_mm": 0.4, "side_lobes": ((0.0, 30.0, 0.1),)}}
+    scene = scene_of(plate(), block((40.0, 6.0, 12.0), (0.0, 0.0, -6.0), reflectance=0.5))
+    sensor, images = altered(cropped(thesis, 160, 160), changes), []
     monkeypatch.setattr("twin.light.renderer._WIDE_PX", math.inf)
     for faint in (0.01, 0.0):
         monkeypatch.setattr("twin.light.sheet._FAINT_PEAK", faint)
@@ -108,17 +114,10 @@ def test_faint_side_lobes_take_fewer_samples(thesis, monkeypatch):
     assert images[0].sum() == pytest.approx(images[1].sum(), rel=3e-4)
 
 
-def test_slight_texture_takes_fewer_samples_in_lamp_images(thesis, monkeypatch):
+def test_slight_texture_takes_fewer_samples_in_lamp_images(thesis, monkeypatch, rendered):
     spotted = plate(reflectance=0.5) | {"mottle": 0.15, "mottle_mm": 3.0}
     scene = scene_of(spotted, block((40.0, 6.0, 12.0), (0.0, 0.0, -6.0), reflectance=0.1))
-    sensor, images, rendered = cropped(thesis, 160, 160), [], []
-    whole = PixelSampler.render
-
-    def counted(self: PixelSampler, *arguments: Any, spp: int, **kwargs: Any) -> np.ndarray:
-        rendered[-1] += len(arguments[2]) * spp
-        return whole(self, *arguments, spp=spp, **kwargs)
-
-    monkeypatch.setattr(PixelSampler, "render", counted)
+    sensor, images = cropped(thesis, 160, 160), []
     for share in (0.05, 0.0):
         monkeypatch.setattr("twin.light.renderer.EDGE_SHARE", share)
         rendered.append(0)
@@ -131,25 +130,17 @@ def test_slight_texture_takes_fewer_samples_in_lamp_images(thesis, monkeypatch):
     assert images[0].sum() == pytest.approx(images[1].sum(), rel=3e-4)
 
 
-def test_wide_stripes_take_fewer_samples_where_they_are_smooth(thesis, monkeypatch):
+def test_wide_stripes_take_fewer_samples_where_they_are_smooth(thesis, monkeypatch, rendered):
     # 23 px of standard deviation, broken by the edges and the shadow of a block.
     sensor = altered(cropped(thesis, 160, 160), {"laser": {"waist_radius_mm": 8.0}})
     scene = scene_of(plate(), block((40.0, 6.0, 12.0), (0.0, 0.0, -6.0), reflectance=0.5))
     renderer = Renderer(sensor, clear(0.3), scene, effects=replace(NONE, defocus=True))
-    rendered = 0
-    whole = PixelSampler.render
-
-    def counted(self: PixelSampler, *arguments: Any, spp: int, **kwargs: Any) -> np.ndarray:
-        nonlocal rendered
-        rendered += len(arguments[2]) * spp
-        return whole(self, *arguments, spp=spp, **kwargs)
-
-    monkeypatch.setattr(PixelSampler, "render", counted)
+    rendered.append(0)
     image = renderer.laser_frame(sensor_at(), spp=16).irradiance()
-    few, rendered = rendered, 0
+    rendered.append(0)
     monkeypatch.setattr("twin.light.renderer._WIDE_PX", math.inf)
     everywhere = renderer.laser_frame(sensor_at(), spp=16).irradiance()
-    assert 0.2 * rendered < few < 0.7 * rendered
+    assert 0.2 * rendered[1] < rendered[0] < 0.7 * rendered[1]
     change = np.abs(image - everywhere) / everywhere.max()
     # Means over a pixel by four samples are off by a part of the second difference, which is 1e-3 at most.
     assert (change == 0).sum() > 500, "edges are rendered as finely as before"

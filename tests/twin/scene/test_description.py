@@ -18,7 +18,13 @@ from twin.scene.scene_object import Pose
 from uwlts.errors import DescriptionError
 from uwlts.model.library import library_folder, list_names, load_sensor
 
-PLACES = [(scene, place) for scene in list_names() for place in load_scene(scene).placements]
+BUILT_SLOWLY = "vehicle-pass"
+"""A sea floor of 20 m, whose mesh takes ten seconds."""
+PLACES = [
+    pytest.param(scene, place, marks=[pytest.mark.slow] if scene == BUILT_SLOWLY else [])
+    for scene in list_names()
+    for place in load_scene(scene).placements
+]
 
 
 def built(scene: Scene) -> Objects:

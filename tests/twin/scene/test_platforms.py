@@ -112,14 +112,14 @@ def test_a_table_turns_the_sensor_the_other_way_round_its_axis():
 
 def test_a_robot_reports_its_own_kinematics_and_errs_by_its_joints():
     """Wrong zeros of 0.01 deg at a reach of 0.4 to 0.8 m: tenths of a mm. A perfect robot is where it should be."""
-    perfect = Robot(kind="robot", waypoints=views(5), mount=MOUNT)
+    perfect = Robot(kind="robot", waypoints=views(3), mount=MOUNT)
     course = perfect.course()
     times = np.array([shot.time_s for shot in course.shots])
     expected = np.array([waypoint.matrix() for waypoint in perfect.waypoints])
     np.testing.assert_allclose(course.poses(times), expected, atol=0.01)
     np.testing.assert_allclose(course.reported @ MOUNT.matrix(), expected, atol=0.01)
     wrong = Robot(
-        kind="robot", waypoints=views(5), joint_zero_std_deg=0.01, joint_repeat_std_deg=0.002, link_std_mm=0.1
+        kind="robot", waypoints=views(3), joint_zero_std_deg=0.01, joint_repeat_std_deg=0.002, link_std_mm=0.1
     )
     course = wrong.course()
     off = np.linalg.norm(course.poses(times)[:, :3, 3] - course.reported[:, :3, 3], axis=1)

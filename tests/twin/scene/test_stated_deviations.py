@@ -69,6 +69,7 @@ def test_only_larger_deviations_than_stated_are_named(campaign: Campaign, key: s
         assert found.deviation > found.expanded
 
 
+@pytest.mark.slow
 def test_named_half_widths_contain_95_percent_of_what_is_drawn(campaign: Campaign):
     """Temperatures, step heights and window tilts of 400 seeds: 95 % within 4 standard deviations of the share."""
     half_k, half_mm, tilt_deg, seeds = 7.0, 0.05, 1.0, 400

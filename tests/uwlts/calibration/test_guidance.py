@@ -263,27 +263,39 @@ def test_more_coverage_than_wanted_does_not_replace_other_evidence(setting):
     assert shortfall(half) - shortfall(most) == pytest.approx(4 * 0.05 * (most - half), abs=1e-9)
 
 
-def test_advised_poses_beat_as_many_random_ones(setting):
-    wanted = CompletionLimits(focal_std_px=1e-6, centre_std_px=1e-6)
-    count = 6
-    wished = led(setting, wanted, np.random.default_rng(3), most=count)
+@pytest.fixture(scope="module")
+def advised(setting) -> State:
+    """Return the state after six advised poses."""
+    return led(setting, LIMITS, np.random.default_rng(3), most=6)
+
+
+UNREACHED = CompletionLimits(focal_std_px=1e-6, centre_std_px=1e-6)
+
+
+@pytest.fixture(scope="module")
+def wished(setting) -> State:
+    """Return the state after six poses, advised for limits that are never reached."""
+    return led(setting, UNREACHED, np.random.default_rng(3), most=6)
+
+
+def test_advised_poses_beat_as_many_random_ones(setting, wished):
+    count = len(wished.poses)
     options = [*candidates(solve_state([], setting, LIMITS))]
     assert len(options) > 20
     stds = []
-    for draw in range(12):
+    for draw in range(8):
         rng = np.random.default_rng(draw)
         chosen = [options[k].pose for k in rng.choice(len(options), count, replace=False)]
-        stds.append(state_of(setting, chosen, rng, wanted).std()[LensParameter.F])
+        stds.append(state_of(setting, chosen, rng, UNREACHED).std()[LensParameter.F])
     # Better than the typical draw, and than nearly every one.
     assert wished.std()[LensParameter.F] < 0.8 * np.median(stds)
-    assert np.mean(np.array(stds) > wished.std()[LensParameter.F]) >= 10 / 12
+    assert np.mean(np.array(stds) > wished.std()[LensParameter.F]) >= 7 / 8
 
 
-def test_what_is_expected_of_an_image_comes_true(setting):
+def test_what_is_expected_of_an_image_comes_true(wished):
     """The standard deviations expected from the information are those of the solution; the description adds little."""
-    state = led(setting, CompletionLimits(focal_std_px=1e-6, centre_std_px=1e-6), np.random.default_rng(5), most=6)
-    expected = state.expected_std()
-    for key, std in state.std().items():
+    expected = wished.expected_std()
+    for key, std in wished.std().items():
         # The solution's scatter has some 1000 degrees of freedom, the start of the lens matters at the percent level.
         assert expected[key] == pytest.approx(std, rel=0.1), key
 
@@ -330,14 +342,13 @@ def test_what_is_missing_is_said(setting):
     assert "never tilted away by 12 deg: the target's right side, left side, lower side, upper side" in said
 
 
-def test_a_sheet_without_stripes_is_missing(setting):
-    state = led(setting, LIMITS, np.random.default_rng(3), most=5)
-    assert state.solution is not None
-    assert "the laser line is on the target in 0 of 5 images" in describe_missing_sheet(state)[0]
+def test_a_sheet_without_stripes_is_missing(advised):
+    assert advised.solution is not None
+    assert "the laser line is on the target in 0 of 6 images" in describe_missing_sheet(advised)[0]
 
 
-def test_an_image_that_contradicts_the_others_is_refused_with_its_residual(setting):
-    state = led(setting, LIMITS, np.random.default_rng(3), most=6)
+def test_an_image_that_contradicts_the_others_is_refused_with_its_residual(setting, advised):
+    state = advised
     rng = np.random.default_rng(2)
     wish = best_pose(state)
     right = RecordedPose(seen(setting, wish.candidate.pose, rng), NO_STRIPE, 9.0)

@@ -72,28 +72,20 @@ def scanned(rng, *, change=None, common=True, surface=height, calibration=None):
 
 @pytest.mark.slow
 def test_nothing_is_claimed_where_nothing_changed():
-    rng = np.random.default_rng(2)
-    shares = []
-    for _ in range(8):
-        change = uwlts.compare_clouds(scanned(rng), scanned(rng))
-        assert change.compared.mean() > 0.95
-        shares.append(change.significant[change.compared].mean())
-    # Errors common to all points make the fractions of single pairs scatter widely about 5 %.
-    assert np.mean(shares) < 0.12
-    quiet = [uwlts.compare_clouds(scanned(rng, common=False), scanned(rng, common=False)) for _ in range(3)]
-    claimed = np.mean([share(each) for each in quiet])
-    assert 0.005 < claimed < 0.08
-
-
-@pytest.mark.slow
-def test_the_level_is_that_of_the_distances():
     """Over many pairs distances scatter by the level over 1.96, common errors included."""
-    rng = np.random.default_rng(3)
-    ratios = []
+    rng = np.random.default_rng(2)
+    shares, ratios = [], []
     for _ in range(8):
         change = uwlts.compare_clouds(scanned(rng), scanned(rng), disc_mm=6.0)
+        assert change.compared.mean() > 0.95
+        shares.append(change.significant[change.compared].mean())
         ratios.append(1.96 * change.distance_mm[change.compared] / change.level_mm[change.compared])
+    # Errors common to all points make the fractions of single pairs scatter widely about 5 %.
+    assert np.mean(shares) < 0.12
     assert 0.6 < np.sqrt(np.mean(np.square(np.concatenate(ratios)))) < 1.5
+    quiet = [uwlts.compare_clouds(scanned(rng, common=False), scanned(rng, common=False)) for _ in range(2)]
+    claimed = np.mean([share(each) for each in quiet])
+    assert 0.005 < claimed < 0.08
 
 
 def test_what_one_calibration_shares_cancels():
@@ -177,7 +169,7 @@ def test_a_given_shape_is_taken_as_it_is(ball, tmp_path):
     assert np.mean(given.distance_mm[far] - (0.05 - 0.02 * z)) == pytest.approx(0, abs=0.003)
     (tmp_path / "ball.toml").write_text('kind = "sphere"\ndiameter_mm = 50.0\npoint_mm = [0, 0, 0.2]\n')
     moved = uwlts.compare_clouds(cloud, tmp_path / "ball.toml", register=True)
-    # Rotations about the sphere's centre are undetermined; 10,000 points of 0.02 mm, the bump gets zero weight.
+    # Rotations about the sphere's centre are undetermined; 5,000 points of 0.02 mm, the bump gets zero weight.
     centre = moved.registration.transform[:3] @ [0, 0, 0, 1]
     np.testing.assert_allclose(centre, [0, 0, 0.2], atol=0.005)
     for text in ('kind = "sphere"\npoint_mm = [0, 0, 0]\n', 'kind = "cone"\n', "kind = \n"):
@@ -231,20 +223,12 @@ def test_a_moved_cloud_is_registered():
     assert change.significant[change.compared & (np.hypot(x - 10, y - 5) > 8)].mean() < 0.12
 
 
-@pytest.mark.parametrize(
-    ("surface", "open_words"),
-    [
-        (lambda x, y: 0 * x, ("shift along x", "shift along y", "turn about z")),
-        (lambda x, y: np.sqrt(150.0**2 - x**2) - 150.0, ("shift along y",)),
-    ],
-    ids=["plane", "pipe"],
-)
-def test_what_a_shape_does_not_tell_is_left_as_it_was(surface, open_words):
+def test_what_a_shape_does_not_tell_is_left_as_it_was():
     rng = np.random.default_rng(6)
-    before, after = scanned(rng, common=False, surface=surface), scanned(rng, common=False, surface=surface)
+    before, after = scanned(rng, common=False, surface=tube), scanned(rng, common=False, surface=tube)
     shifted = PointCloud(after.points_mm + [0.0, 0.6, 0.2], after.intensity, after.frame, after.line)
     found = uwlts.compare_clouds(shifted, before, register=True).registration
-    assert set(open_words) <= {name for words in found.open_directions for name in words.split(" with ")}
+    assert "shift along y" in {name for words in found.open_directions for name in words.split(" with ")}
     assert abs(found.transform[1, 3]) < 0.05 and found.transform[2, 3] == pytest.approx(-0.2, abs=0.05)
 
 
@@ -279,7 +263,7 @@ def ball(tmp_path_factory):
     path = tmp_path_factory.mktemp("mesh") / "ball.stl"
     trimesh.creation.icosphere(subdivisions=6, radius=25.0).export(path)
     rng = np.random.default_rng(7)
-    direction = rng.normal(size=(40000, 3))
+    direction = rng.normal(size=(20000, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     direction = direction[direction[:, 2] < -0.5]
     bump = 0.3 * (np.degrees(np.arccos(-direction[:, 2])) < 8)
@@ -326,10 +310,8 @@ def test_the_command_writes_page_figures_and_cloud(ball, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = ["compare", "ball.ply", str(path), "--out", "change.html", "--coloured", "change.ply"]
     app(words, result_action="return_value")
-    app(
-        ["compare", "ball.ply", str(path), "--out", "again.html", "--coloured", "change.laz"],
-        result_action="return_value",
-    )
+    change = uwlts.compare_clouds(cloud, path)
+    uwlts.report.write_change("again.html", change, coloured="change.laz")
     record = json.loads((tmp_path / "change.json").read_text())
     assert record["largest_rise_mm"] == pytest.approx(0.3, abs=0.05) and record["registration"] is None
     places, _ = read_ply(tmp_path / "change.ply", "vertex", called="cloud")
@@ -348,7 +330,7 @@ def test_the_command_writes_page_figures_and_cloud(ball, tmp_path, monkeypatch):
     page = (tmp_path / "change.html").read_text()
     assert "level of detection" in page and "ball.ply against ball.stl" in page
     with pytest.raises(OutputError, match="exists already"):
-        uwlts.report.write_change("change.html", uwlts.compare_clouds(cloud, path))
+        uwlts.report.write_change("change.html", change)
 
 
 def test_all_regions_are_listed_whatever_the_size_of_the_cloud(monkeypatch, tmp_path):

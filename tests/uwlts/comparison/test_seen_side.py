@@ -24,7 +24,7 @@ def scan(rng, thickness, *, spacing, sides, wear=0.0):
     return np.concatenate([np.column_stack([x, y, side * z]) for side in sides])
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("sides", [(-1,), (1,), (-1, 1)])
 def test_a_thin_part_is_compared_with_the_side_that_was_seen(seed, sides, tmp_path):
     """Distances beside the wear are zero, and in it the wear, for any thickness, spacing and pose."""

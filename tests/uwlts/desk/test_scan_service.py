@@ -212,6 +212,7 @@ def test_a_scan_without_a_pose_is_kept_but_gives_no_advice(tmp_path, lit, calibr
     assert said[-1].startswith("error: no pose of the sensor is known for test-plate-001.h5"), said
 
 
+@pytest.mark.slow
 def test_the_next_pass_is_advised_after_each_one(tmp_path):
     *_, problem = campaign(9, dict(list(SHIFTED.items())[1:]))
     advice, told = PassAdvice(as_built(SENSOR, WATER), pose_std_mm=0.01, pose_std_deg=0.005), []

@@ -90,11 +90,11 @@ def test_two_spheres_before_a_wall_with_outliers(wall_z):
 @pytest.mark.slow
 def test_the_spacing_error_scatters_as_stated_and_has_no_bias():
     scaled = []
-    for seed in range(24):
+    for seed in range(16):
         result = evaluate_cloud(cloud_of(dumbbell(np.random.default_rng(seed), count=400, half_angle_deg=50)), DUMBBELL)
         scaled.append(result.spacings[0].sse_mm / result.spacings[0].spacing_std_mm)
-    # 24 values of unit variance: mean 0 +- 0.20, standard deviation 1 +- 0.145; four of these.
-    assert abs(np.mean(scaled)) < 0.8
+    # 16 values of unit variance: mean 0 +- 0.25, standard deviation 1 +- 0.18; three of these.
+    assert abs(np.mean(scaled)) < 0.75
     assert np.std(scaled) == pytest.approx(1, abs=0.58)
 
 
@@ -291,19 +291,6 @@ def test_profiles_are_labelled_and_measured(shape):
     assert kept > 24 * 900 * (1 - 24 / 176 - 0.02)
     # The root mean square of 24 values of unit variance is outside these limits in 2e-5 of all draws.
     assert 0.45 < np.sqrt(np.mean(np.square(scaled))) < 1.66
-
-
-@pytest.mark.slow
-def test_the_height_of_many_profiles_has_no_bias_and_the_stated_scatter():
-    heights, stated = [], []
-    for seed in range(49):
-        points, _ = step_profile(np.random.default_rng(seed), "base, block, base", tilt_deg=6)
-        height = step_height(points, label_step_faces(points, height_mm=HEIGHT))
-        heights.append(height.height_mm)
-        stated.append(height.std_mm)
-    assert abs(np.mean(heights) - HEIGHT) < 4 * np.mean(stated) / 7
-    # The standard deviation of 49 values is known to 10 %.
-    assert np.std(heights) == pytest.approx(np.mean(stated), rel=0.4)
 
 
 def test_rounded_edges_stay_out():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import uwlts
-from tests.uwlts.storage.test_capture import a_header
+from tests.uwlts.storage.drawn_captures import a_header
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import make_foreign_cloud
 

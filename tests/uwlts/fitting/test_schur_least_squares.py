@@ -5,6 +5,7 @@ import pytest
 from scipy import sparse
 from scipy.linalg import block_diag
 
+from uwlts.errors import CalibrationError
 from uwlts.fitting.schur_least_squares import LocalPrior, Observation, invert_block, schur_least_squares
 
 HEAD, ALONE = 8, 30
@@ -80,10 +81,14 @@ def test_a_linear_problem_has_the_solution_and_covariance_of_the_normal_equation
 
     found = schur_least_squares(model, np.zeros(3), [np.zeros(2)] * 2)
     whole = np.hstack([by_global.reshape(60, 3), block_diag(*by_local)])
-    solution = np.linalg.lstsq(whole, values.ravel())[0]
+    solution, squares, _, _ = np.linalg.lstsq(whole, values.ravel())
     np.testing.assert_allclose(np.r_[found.global_values, *found.local], solution, rtol=1e-6)
-    inverse = np.linalg.inv(whole.T @ whole)
-    np.testing.assert_allclose(found.covariance / found.sigma**2, inverse[:3, :3], rtol=1e-6)
+    covariance = squares[0] / (60 - 7) * np.linalg.inv(whole.T @ whole)
+    assert found.sigma**2 == pytest.approx(squares[0] / (60 - 7))
+    np.testing.assert_allclose(found.covariance, covariance[:3, :3], rtol=1e-6)
+    np.testing.assert_allclose(found.local_covariances[1], covariance[5:, 5:], rtol=1e-6)
+    with pytest.raises(CalibrationError, match="behind"):
+        schur_least_squares(lambda *_: None, np.zeros(3), [np.zeros(2)])
 
 
 def curve(residual, derivative, *, feasible=lambda x: True):

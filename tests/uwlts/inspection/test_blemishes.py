@@ -22,6 +22,7 @@ from uwlts.inspection.blemishes import (
 from uwlts.inspection.features import FeatureValue
 
 
+@pytest.mark.slow
 def test_shallow_pits_are_as_deep_as_they_are_on_average() -> None:
     """Sixteen pits four times as deep as the noise: the largest of noisy depths is 0.017 mm too deep on average.
 

@@ -1,7 +1,6 @@
 """Inspections of pipes along any axis: equal findings, none lost, none twice, none on undamaged pipes.
 
-Pipes are those of `tests.oracles.pipes`. Gates on depths are 4.5 standard uncertainties, exceeded by a normal error 7
-times in a million. Each search has a false-alarm probability of 1e-4, all of them together 1 %.
+Pipes are those of `tests.oracles.pipes`. Each search has a false-alarm probability of 1e-4, all of them together 1 %.
 """
 
 from dataclasses import replace
@@ -9,34 +8,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import uwlts
 from tests.oracles.pipes import Bump, ScannedPipe, scan_pipe
+from tests.uwlts.inspection.inspected_pipes import BLEMISHES, GATE, cloud_of, inspect
+from uwlts.inspection.blemish_search import BlemishSearch, Indication
 from uwlts.inspection.features import Feature, FeatureKind, Inspection
+from uwlts.inspection.pipe import _join_copies
 from uwlts.inspection.pipe_form import fit_pipe, refit_pipe
 from uwlts.shapes.cylinder import Cylinder
-from uwlts.storage.cloud import PointCloud
 
+FALSE_ALARM = 1e-4
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0), "tilted": (1.0, 0.3, -0.2)}
-GATE, FALSE_ALARM = 4.5, 1e-4
-DRAWS = [
-    *(pytest.param(axis, 1, id=f"{name}-1") for name, axis in AXES.items()),
-    *(
-        pytest.param(AXES[name], seed, id=f"{name}-{seed}", marks=pytest.mark.slow)
-        for name, seed in zip(AXES, (0, 2, 3, 4), strict=True)
-    ),
-]
-"""Axis and seed: a pipe along each axis, and one more in slow tests."""
+DRAWS = pytest.mark.parametrize(("axis", "seed"), list(zip(AXES.values(), range(4), strict=True)), ids=AXES)
 DEPTHS_MM = 0.3, 0.6, 1.2, 2.0, 3.0
 """The shallowest is fifteen times the noise of a point; the deepest is within the 6 % of the radius that count."""
-BLEMISHES = FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION
-
-
-def cloud_of(pipe: ScannedPipe) -> PointCloud:
-    return PointCloud(pipe.points_mm, np.ones(len(pipe.points_mm)), pipe.frame, pipe.line)
-
-
-def inspected(pipe: ScannedPipe) -> Inspection:
-    return uwlts.inspect_pipe(cloud_of(pipe), false_alarm=FALSE_ALARM)
 
 
 def matched(pipe: ScannedPipe, found: Inspection, bumps: list[Bump]) -> list[Feature]:
@@ -55,7 +39,7 @@ def matched(pipe: ScannedPipe, found: Inspection, bumps: list[Bump]) -> list[Fea
     return own
 
 
-@pytest.mark.parametrize(("axis", "seed"), DRAWS)
+@DRAWS
 def test_all_pits_are_found_along_any_axis(axis: tuple[float, float, float], seed: int) -> None:
     """Pits all around the pipe; in some runs one of them is at the cut."""
     rng = np.random.default_rng([seed, 1])
@@ -70,36 +54,54 @@ def test_all_pits_are_found_along_any_axis(axis: tuple[float, float, float], see
         for k, depth in enumerate(rng.permutation(DEPTHS_MM))
     ]
     pipe = scan_pipe(rng, axis=axis, length_mm=90.0, bumps=bumps, holes=[(0.0, 2.5 * turn, 6.0)])
-    found = inspected(pipe)
+    found = inspect(pipe, false_alarm=FALSE_ALARM)
     matched(pipe, found, bumps)
     assert not any("is omitted" in note for note in found.notes)
 
 
-@pytest.mark.parametrize(("axis", "seed"), DRAWS)
+@DRAWS
 def test_clean_pipes_have_no_findings_along_any_axis(axis: tuple[float, float, float], seed: int) -> None:
     rng = np.random.default_rng([seed, 2])
     arc = 2 * np.pi if seed % 2 else 0.8 * np.pi
-    found = inspected(scan_pipe(rng, axis=axis, arc=arc, spacing_mm=1.5, holes=[(5.0, 1.0, 15.0)]))
+    pipe = scan_pipe(rng, axis=axis, arc=arc, spacing_mm=1.5, holes=[(5.0, 1.0, 15.0)])
+    found = inspect(pipe, false_alarm=FALSE_ALARM)
     assert not found.select(*BLEMISHES) and not any("is omitted" in note for note in found.notes)
 
 
 def test_a_dent_at_the_cut_is_one_finding() -> None:
     """Dents wider than the overlap of both sides, about a gap that determines the cut, at -0.02 rad."""
-    for seed in (0, 2, 5):
+    for seed in (0, 5):
         rng, angle = np.random.default_rng([seed, 3]), -0.02 + 0.005 * (seed - 2.5)
         dent = Bump(along_mm=0.0, angle=float(angle), diameter_mm=70.0, height_mm=-3.0)
         pipe = scan_pipe(
-            rng, axis=(1, 0, 0), arc=2 * np.pi - 0.04, length_mm=150.0, spacing_mm=2.0, bumps=[dent], lost=0.0
+            rng, axis=(1, 0, 0), arc=2 * np.pi - 0.04, length_mm=110.0, spacing_mm=2.0, bumps=[dent], lost=0.0
         )
-        (own,) = matched(pipe, inspected(pipe), [dent])
+        (own,) = matched(pipe, inspect(pipe, false_alarm=FALSE_ALARM), [dent])
         assert own.kind == FeatureKind.DENT
+
+
+def test_copies_of_an_indication_on_both_sides_of_the_cut_are_joined() -> None:
+    """Points 8 to 11 are copies of 0 to 3: two indications share point 2, one of the other sign shares it alone."""
+    copied, nothing = np.array([*range(8), *range(4)]), np.zeros(12, bool)
+    found = [
+        Indication(2.0, height, 9.0, 1e-9, 0.02, np.array(points))
+        for height, points in ((-1.0, [1, 2]), (-1.0, [10, 11, 7]), (1.0, [2]), (-1.0, [5]))
+    ]
+    search = BlemishSearch(tuple(found), (), nothing, ~nothing, np.ones(12), 1.0, 1.0, 5.0, 1e-4)
+    joined = _join_copies(search, copied, 8)
+    assert [(each.height_mm, each.points.tolist()) for each in joined.indications] == [
+        (-1.0, [1, 2, 3, 7]),
+        (1.0, [2]),
+        (-1.0, [5]),
+    ]
+    assert joined.undamaged.tolist() == [True, False, False, False, True, False, True, False]
 
 
 @pytest.mark.parametrize("axis", AXES.values(), ids=AXES)
 def test_noise_turns_no_frame(axis: tuple[float, float, float]) -> None:
     """Both directions across are equal for all scans, and for successive fits of a pipe."""
     across = []
-    for seed in range(20):
+    for seed in range(6):
         rng = np.random.default_rng([seed, 4])
         pipe = scan_pipe(rng, axis=axis, length_mm=60.0, spacing_mm=4.0)
         across.append(Cylinder.fit(pipe.points_mm).across)
@@ -121,7 +123,7 @@ def test_what_is_left_out_is_named() -> None:
     along, angle = pipe.own_places(pipe.points_mm)
     kept = (along < 20) | (along > 50) | (np.abs(angle) < 0.3)
     seen = replace(pipe, points_mm=pipe.points_mm[kept], frame=pipe.frame[kept], line=pipe.line[kept])
-    notes = inspected(seen).notes
+    notes = inspect(seen, false_alarm=FALSE_ALARM).notes
     off = next(note for note in notes if "off the pipe" in note)
     height = deep.heights(along, angle, pipe.radius_mm)
     # Points at the limit may be on either side by their noise.

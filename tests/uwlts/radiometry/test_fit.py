@@ -143,6 +143,7 @@ def test_another_phase_function_is_not_noticed_from_the_halo():
     assert max(misfits(evidence)) < 1
 
 
+@pytest.mark.slow
 def test_the_uncertainty_contains_another_phase_function():
     """Scattering, attenuation and background of drawn phase functions, fitted as Petzold's average particle."""
     rng = np.random.default_rng(7)

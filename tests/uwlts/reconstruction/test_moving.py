@@ -61,61 +61,45 @@ def test_poses_in_the_capture_are_the_platform_s_with_a_mount(tmp_path, expected
     np.testing.assert_allclose(cloud.points_mm, expected, atol=1e-8)
 
 
-@pytest.mark.parametrize("with_offset", [False, True])
-def test_images_are_placed_along_the_trajectory_at_their_times(tmp_path, expected, with_offset):
-    """The clock of the platform is 100 s ahead, as the mount or the caller says."""
-    path = record(tmp_path / "moving.h5")
-    times = np.array([99.5, 100.3, 101.0, 102.9, 104.2])
-    trajectory = uwlts.Trajectory(times, np.array([platform_at(STEP_MM * (time - 100)) for time in times]))
-    known = known_mount(MOUNT) if with_offset else known_mount(MOUNT, time_offset_s=100.0, time_offset_std_s=1e-4)
-    offset = 100.0 if with_offset else None
-    cloud = uwlts.reconstruct(path, CALIBRATION, mount=known, trajectory=trajectory, clock_offset_s=offset)
-    np.testing.assert_allclose(cloud.points_mm, expected, atol=1e-8)
+KNOWN_S = np.array([-0.5, 0.3, 1.0, 2.9, 4.2])
 
 
-def test_a_clock_may_run_faster_than_the_camera_s(tmp_path, expected):
-    path, ppm = record(tmp_path / "moving.h5"), 2000.0
-    times = 50.0 + (1 + 1e-6 * ppm) * np.array([-0.5, 0.3, 1.0, 2.9, 4.2])
-    poses = np.array([platform_at(STEP_MM * time) for time in (-0.5, 0.3, 1.0, 2.9, 4.2)])
-    clock = {"clock_offset_s": 50.0, "clock_drift_ppm": ppm}
-    cloud = uwlts.reconstruct(
-        path, CALIBRATION, mount=known_mount(MOUNT), trajectory=uwlts.Trajectory(times, poses), **clock
-    )
-    np.testing.assert_allclose(cloud.points_mm, expected, atol=1e-8)
-    with pytest.raises(uwlts.Error, match="drifts by 1e[+]06 ppm"):
-        uwlts.reconstruct(
-            path, CALIBRATION, trajectory=uwlts.Trajectory(times, poses), clock_offset_s=50.0, clock_drift_ppm=1e6
-        )
-    with pytest.raises(uwlts.Error, match="without a trajectory"):
-        uwlts.reconstruct(path, CALIBRATION, mount=known_mount(MOUNT), clock_drift_ppm=ppm)
-
-
-def test_a_trajectory_without_a_mount_is_the_sensor_s(tmp_path, expected):
-    poses = np.array([platform_at(STEP_MM * time) for time in (0.0, 4.0)]) @ MOUNT
-    trajectory = uwlts.Trajectory(np.array([0.0, 4.0]), poses)
-    cloud = uwlts.reconstruct(record(tmp_path / "moving.h5"), CALIBRATION, trajectory=trajectory)
-    np.testing.assert_allclose(cloud.points_mm, expected, atol=1e-8)
-
-
-def test_the_robot_s_scale_stretches_its_positions(tmp_path, expected):
-    scale, path = 1.0005, tmp_path / "moving.h5"
-    record(path)
-    poses = np.array([platform_at(STEP_MM * time) for time in (0.0, 4.0)])
+def trajectory(times=KNOWN_S, *, by=None, scale=1.0):
+    """Return the platform's trajectory by its clock, whose positions a robot reports too small by ``scale``."""
+    poses = np.array([platform_at(STEP_MM * time) for time in KNOWN_S]) @ (np.eye(4) if by is None else by)
     poses[:, :3, 3] /= scale
-    trajectory, known = uwlts.Trajectory(np.array([0.0, 4.0]), poses), known_mount(MOUNT, robot_scale=scale)
-    cloud = uwlts.reconstruct(path, CALIBRATION, mount=known, trajectory=trajectory)
+    return uwlts.Trajectory(times, poses)
+
+
+@pytest.mark.parametrize(
+    ("way", "mount", "clock"),
+    [
+        (trajectory(100 + KNOWN_S), known_mount(MOUNT, time_offset_s=100.0, time_offset_std_s=1e-4), {}),
+        (trajectory(100 + KNOWN_S), known_mount(MOUNT), {"clock_offset_s": 100.0}),
+        (trajectory(50 + 1.002 * KNOWN_S), known_mount(MOUNT), {"clock_offset_s": 50.0, "clock_drift_ppm": 2000.0}),
+        (trajectory(scale=1.0005), known_mount(MOUNT, robot_scale=1.0005), {}),
+        (trajectory(by=MOUNT), None, {}),
+    ],
+    ids=["offset of the mount", "offset", "drift", "robot's scale", "of the sensor"],
+)
+def test_images_are_placed_along_the_trajectory_at_their_times(tmp_path, expected, way, mount, clock):
+    path = record(tmp_path / "moving.h5")
+    cloud = uwlts.reconstruct(path, CALIBRATION, mount=mount, trajectory=way, **clock)
     np.testing.assert_allclose(cloud.points_mm, expected, atol=1e-8)
 
 
-def test_a_mount_without_poses_is_refused(tmp_path):
-    with pytest.raises(uwlts.Error, match="4 of 4 laser images have no pose.*trajectory"):
-        uwlts.reconstruct(record(tmp_path / "stage.h5", stage=True), CALIBRATION, mount=known_mount(MOUNT))
-
-
-def test_images_outside_the_trajectory_are_refused(tmp_path):
-    trajectory = uwlts.Trajectory(np.array([1.0, 9.0]), np.array([platform_at(0.0), platform_at(8.0)]))
-    with pytest.raises(uwlts.Error, match="1 of 4 times"):
-        uwlts.reconstruct(record(tmp_path / "moving.h5"), CALIBRATION, trajectory=trajectory)
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"trajectory": trajectory(), "clock_offset_s": 0.0, "clock_drift_ppm": 1e6}, "drifts by 1e[+]06 ppm"),
+        ({"mount": known_mount(MOUNT), "clock_drift_ppm": 2000.0}, "without a trajectory"),
+        ({"mount": known_mount(MOUNT)}, "4 of 4 laser images have no pose.*trajectory"),
+        ({"trajectory": trajectory(KNOWN_S + 1.0)}, "1 of 4 times"),
+    ],
+)
+def test_images_without_a_place_are_refused(tmp_path, given, says):
+    with pytest.raises(uwlts.Error, match=says):
+        uwlts.reconstruct(record(tmp_path / "stage.h5", stage=True), CALIBRATION, **given)
 
 
 def test_the_mount_s_uncertainty_moves_points_as_other_mounts_do():

@@ -34,7 +34,6 @@ from uwlts.shapes.sphere import Sphere
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, describe_source
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
-from uwlts.storage.cloud_files import read_cloud, write_cloud
 from uwlts.stripe import extract_stripe
 
 BUILT = built_sensor()
@@ -102,12 +101,12 @@ def test_the_stripes_noise_is_that_of_its_image(stripes):
 def test_noise_that_neighbours_share_counts_as_in_means(lines, expected):
     """A moving mean leaves the variance of long means; of differences of means of four, it leaves ``expected`` squared.
 
-    Second differences alone would give 1, 0.41 and 0.27. One of sixteen differences is independent: 4 % is more than
-    five standard deviations of their median.
+    Second differences alone would give 1, 0.41 and 0.27. One of sixteen differences is independent: 4 % is nearly
+    four standard deviations of their median.
     """
-    noise = np.random.default_rng(11).normal(0, 0.1, 400_000 + lines - 1)
-    line = np.arange(400_000)
-    centre = 300 + 1e-10 * (line - 2e5) ** 2 + np.convolve(noise, np.full(lines, 1 / lines), mode="valid")
+    noise = np.random.default_rng(11).normal(0, 0.1, 200_000 + lines - 1)
+    line = np.arange(200_000)
+    centre = 300 + 4e-10 * (line - 1e5) ** 2 + np.convolve(noise, np.full(lines, 1 / lines), mode="valid")
     found = estimate_stripe_noise_px(np.zeros_like(line), line, centre)
     assert found == pytest.approx(0.1 * expected, rel=0.04)
 
@@ -262,41 +261,6 @@ def test_another_water_is_known_by_its_temperature_only(calibration, stripes, th
     assert 1.5 * sizes[0] < sizes[1] < 0.3
 
 
-def test_a_cloud_keeps_it_in_its_file(calibration, stripes, thesis, tmp_path):
-    frame, line, centre = stripes
-    with capture_of(tmp_path, thesis, MEDIUM) as capture:
-        known = point_uncertainty(capture, calibration, (frame, line, centre))
-    cloud = PointCloud(np.ones((len(line), 3)), np.ones(len(line)), frame, line, uncertainty=known)
-    write_cloud(tmp_path / "a.full.ply", cloud)
-    again = read_cloud(tmp_path / "a.full.ply").uncertainty
-    np.testing.assert_array_equal(again.random_mm2, known.random_mm2)
-    np.testing.assert_array_equal(again.position_mm, known.position_mm)
-    np.testing.assert_array_equal(again.patterns_mm, known.patterns_mm)
-    assert again.std_mm().shape == (len(line), 3)
-
-
-def test_figures_have_the_uncertainty_of_monte_carlo(calibration, stripes, thesis, tmp_path):
-    """A plane's flatness figures by patterns and draws, against 200 draws of both together."""
-    frame, line, centre = stripes
-    near = frame == 0
-    with capture_of(tmp_path, thesis, MEDIUM) as capture:
-        known = point_uncertainty(capture, calibration, (frame[near], line[near], centre[near]))
-    rng = np.random.default_rng(0)
-    grid = np.column_stack([rng.uniform(-20, 20, near.sum()), np.linspace(-60, 60, near.sum()), np.zeros(near.sum())])
-    cloud = PointCloud(grid, np.ones(len(grid)), frame[near], line[near], uncertainty=known)
-    artefact = PlaneStandard(kind="plane")
-    found = figure_uncertainties(cloud, evaluate_cloud(cloud, artefact))
-    along, patterns = noise_shifts(known), known.patterns_mm.astype(float)
-    spread = []
-    for _ in range(200):
-        moved = grid + rng.standard_normal((len(grid), 1)) * along
-        moved = moved + np.einsum("m,mni->ni", rng.standard_normal(len(patterns)), patterns)
-        spread.append(evaluate_cloud(replace(cloud, points_mm=moved), artefact).figures_mm["STD"])
-    total = np.hypot(found["STD"].random_mm, found["STD"].systematic_mm)
-    # STD adds squares, so it is not linear in the patterns: only its size is compared.
-    assert 0.3 * np.std(spread) < total < 3 * np.std(spread)
-
-
 @pytest.fixture(scope="module")
 def spheres():
     """Two caps with what moves their points: noise, the positions of 20 images, and smooth patterns."""
@@ -404,12 +368,14 @@ def test_figures_of_a_plane_are_those_of_a_new_evaluation():
 @pytest.mark.slow
 @pytest.mark.parametrize("body", ["pipe", "step"])
 def test_noise_of_a_size_is_that_of_monte_carlo_and_of_no_seed(body, monkeypatch):
-    """A standard deviation of 400 draws is right to 3.5 %: 4 sigma. Another seed changes sizes by nothing."""
+    """A standard deviation of 200 draws is right to 5 %: 3 sigma. Another seed changes sizes by nothing."""
+    draws = 200
+    monkeypatch.setattr("uwlts.evaluation.figure_uncertainty._MOST_DRAWS", draws)
     points, artefact, name = bodies()[body]
     cloud, rng = cloud_with_errors(points, np.random.default_rng(3)), np.random.default_rng(6)
     evaluation, known = evaluate_cloud(cloud, artefact), cloud.uncertainty
     figures, drawn = linearise_figures(cloud, evaluation), []
-    for _ in range(DRAWS):
+    for _ in range(draws):
         move = rng.standard_normal((len(cloud), 1)) * noise_shifts(known)
         drawn.append(figures.figures_mm(move + rng.standard_normal((20, 1))[cloud.frame] * known.position_mm))
     found = figure_uncertainties(cloud, evaluation)
@@ -417,7 +383,7 @@ def test_noise_of_a_size_is_that_of_monte_carlo_and_of_no_seed(body, monkeypatch
     monkeypatch.setattr("uwlts.fitting.propagation._SEED", 1)
     again = figure_uncertainties(cloud, evaluation)
     assert again[name].random_mm == found[name].random_mm
-    # All others by 400 draws: their ratio is right to 5 %, within 4.5 sigma.
+    # All others by 200 draws: their ratio is right to 7 %, within 3 sigma.
     for each in found:
         assert again[each].random_mm == pytest.approx(found[each].random_mm, rel=0.23), each
 

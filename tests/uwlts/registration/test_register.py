@@ -30,7 +30,7 @@ PIPE = PipeStandard(diameter_mm=2 * RADIUS_MM)
 def pits():
     """Five views of a pipe with pits, their true poses, and the registration from poses wrong by 2 mm and 0.5 deg."""
     scans, true, wrong = views(np.random.default_rng(SEED), radius=pitted)
-    return scans, true, uwlts.register(scans, poses=wrong)
+    return scans, true, wrong, uwlts.register(scans, poses=wrong)
 
 
 def test_patches_follow_a_curved_surface():
@@ -57,7 +57,7 @@ def test_a_surface_lies_on_itself_from_any_side():
 
 
 def test_a_pipe_with_pits_is_closed(pits):
-    _, true, found = pits
+    _, true, _, found = pits
     assert found.open_movements == () and [pair.scans for pair in found.pairs] == [
         (0, 1),
         (0, 4),
@@ -118,9 +118,9 @@ def test_undetermined_motions_are_translations_and_rotations_about_axes():
     assert rotation.describe() == "turn about the line through (5.0, 7.2, -9.6) mm along (0.000, -0.600, 0.800)"
 
 
-def test_a_registration_that_does_not_settle_is_an_error(monkeypatch):
+def test_a_registration_that_does_not_settle_is_an_error(pits, monkeypatch):
     """Two rounds from poses that are wrong by 2 mm, where some ten are needed."""
-    scans, _, wrong = views(np.random.default_rng(SEED), radius=pitted)
+    scans, _, wrong, _ = pits
     monkeypatch.setattr("uwlts.registration.joint_registration.ROUNDS", 1)
     monkeypatch.setattr("uwlts.registration.joint_registration._REFITS", 1)
     with pytest.raises(EvaluationError, match="does not converge: the next round would move a scan by"):
@@ -129,15 +129,15 @@ def test_a_registration_that_does_not_settle_is_an_error(monkeypatch):
 
 @pytest.mark.slow
 def test_the_covariance_is_that_of_the_errors():
-    """Whitened errors of views that share nothing with the simulation: 7 kinds of errors, more than 150 values.
+    """Whitened errors of views that share nothing with the simulation: 7 kinds of errors, more than 100 values.
 
     The sum of squares is within 0.75 and 1.4 times the limits that a chi-square exceeds 1 time in 10,000. The factors
     allow for errors that are correlated, but stated as white (`docs.studies.registration_coverage`).
     """
-    found = [judge(seed, SHAPES[seed % len(SHAPES)], ERRORS[seed % len(ERRORS)]) for seed in range(SEED, SEED + 14)]
+    found = [judge(seed, SHAPES[seed % len(SHAPES)], ERRORS[seed % len(ERRORS)]) for seed in range(SEED, SEED + 10)]
     freedom = sum(each.freedom for each in found)
     low, high = chi2.ppf([5e-5, 1 - 5e-5], freedom)
-    assert freedom > 150
+    assert freedom > 100
     assert 0.75 * low < sum(each.chi_square for each in found) < 1.4 * high
 
 
@@ -153,9 +153,8 @@ def test_understated_noise_is_found_from_the_scatter():
     np.testing.assert_allclose(less.std[1] / right.std[1], 1.0, atol=0.3)
 
 
-@pytest.mark.parametrize("radius", [plain, oval], ids=["plain", "oval"])
-def test_what_a_pipe_does_not_tell_is_named_and_left(radius):
-    scans, true, wrong = views(np.random.default_rng(SEED), radius=radius)
+def test_what_a_pipe_does_not_tell_is_named_and_left():
+    scans, true, wrong = views(np.random.default_rng(SEED), radius=oval)
     found = uwlts.register(scans, poses=wrong)
     shifts = [each for each in found.open_movements if each.point_mm is None]
     turns = [each for each in found.open_movements if each.point_mm is not None]
@@ -171,7 +170,7 @@ def test_what_a_pipe_does_not_tell_is_named_and_left(radius):
     assert np.degrees(np.abs(errors[:, 4:]).max()) < 0.02
     measured = evaluate_pipe(found.cloud.points_mm, PIPE)
     assert measured.diameter_mm == pytest.approx(2 * RADIUS_MM, abs=0.1)
-    assert measured.ovality_mm == pytest.approx(OVALITY_MM if radius is oval else 0.0, abs=0.1)
+    assert measured.ovality_mm == pytest.approx(OVALITY_MM, abs=0.1)
 
 
 def test_a_start_with_its_uncertainty_decides_what_is_open():
@@ -183,7 +182,7 @@ def test_a_start_with_its_uncertainty_decides_what_is_open():
 
 
 def test_the_merged_cloud_knows_how_well_it_lies(pits):
-    scans, true, found = pits
+    scans, true, _, found = pits
     cloud = found.cloud
     assert len(cloud) == sum(map(len, scans)) and len(np.unique(cloud.frame)) == sum(
         len(np.unique(s.frame)) for s in scans

@@ -26,7 +26,7 @@ from uwlts.model.calibration import KnownMedium
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.triangulation import reconstruct_pixels
 from uwlts.report.certificate import certificate_lines, check_certificate, make_certificate, read_certificate
-from uwlts.report.certificate_page import certificate_page, write_certificate
+from uwlts.report.certificate_page import write_certificate
 from uwlts.storage.calibration_file import load_calibration
 
 BUILT = built_sensor()
@@ -56,6 +56,13 @@ def content(calibration, path):
     return make_certificate(calibration, path, issued=ISSUED)
 
 
+@pytest.fixture(scope="module")
+def written(path, thesis):
+    """The certificate's page and its content, compared with the drawings."""
+    nominal_calibration(thesis).save(path.with_name("drawings.json"))
+    return write_certificate(path, out=path.with_name("cert.html"), before=path.with_name("drawings.json"))
+
+
 def test_the_same_calibration_gives_the_same_json(calibration, path, content):
     again = make_certificate(load_calibration(path), path, issued=ISSUED)
     stored = content.in_file()
@@ -65,12 +72,11 @@ def test_the_same_calibration_gives_the_same_json(calibration, path, content):
     assert compute_seal(stored) == content.sha256 == stored["sha256"]
 
 
-def test_a_changed_byte_is_found(calibration, path, content, tmp_path):
-    page = tmp_path / "cert.html"
-    assert write_certificate(path, out=page)[1].parameters == content.parameters
-    beside = tmp_path / "cert.json"
-    assert check_certificate(beside, path) == []
-    text = beside.read_text(encoding="utf-8")
+def test_a_changed_byte_is_found(path, content, written, tmp_path):
+    page, issued = written
+    assert issued.parameters == content.parameters
+    assert check_certificate(page.with_suffix(".json"), path) == []
+    text, beside = page.with_suffix(".json").read_text(encoding="utf-8"), tmp_path / "cert.json"
     place = text.index('"std": ') + 9
     digit = "1" if text[place] != "1" else "2"
     beside.write_text(text[:place] + digit + text[place + 1 :], encoding="utf-8")
@@ -160,11 +166,9 @@ def test_the_largest_uncertainty_of_the_volume_is_stated(use):
     for stated in length_uncertainties(use):
         if stated.axis != "X" and stated.length_mm in (20.0, 50.0):
             places = find_ends(use.region, stated.axis, stated.length_mm)
+            lengths = [compute_volume_lengths(use, place[None]) for place in places]
             for noise, value in ((0.0, stated.calibration_mm), (use.noise_px, stated.point_mm)):
-                alone = [
-                    2 * compute_volume_lengths(use, place[None]).std_mm(use.covariance, noise_px=noise).item()
-                    for place in places
-                ]
+                alone = [2 * each.std_mm(use.covariance, noise_px=noise).item() for each in lengths]
                 assert value == pytest.approx(max(alone), rel=1e-9)
                 assert min(alone) < 0.98 * value
                 checked += 1
@@ -251,8 +255,9 @@ def test_against_another_calibration(calibration, thesis):
         compare_calibrations(calibration, calibration.model_copy(update={"camera": small}), region)
 
 
-def test_the_certificate_is_complete_and_loads_nothing_from_the_network(calibration, content, thesis):
-    page = certificate_page(content, calibration, before=("drawings", nominal_calibration(thesis)))
+def test_the_certificate_is_complete_and_loads_nothing_from_the_network(written):
+    path, content = written
+    page = path.read_text(encoding="utf-8")
     for words in (
         "Uncertainty of lengths",
         "Weakly determined parameters",

@@ -25,7 +25,7 @@ DEPTH_MM, NOISE_MM = 1.5, 0.02
 def folder(tmp_path_factory):
     """A pipe of 120 mm diameter with one pit, whose cloud names a calibration."""
     rng, radius = np.random.default_rng(9), 60.0
-    x, angle = np.meshgrid(np.arange(0, 80, 0.5), np.radians(np.arange(-60, 60, 0.4)), indexing="ij")
+    x, angle = np.meshgrid(np.arange(0, 80, 0.8), np.radians(np.arange(-60, 60, 0.8)), indexing="ij")
     frame = np.repeat(np.arange(len(x)), x.shape[1])
     x, angle = x.ravel(), angle.ravel()
     away = np.hypot(x - 40, radius * angle) / 6

@@ -13,44 +13,59 @@ from uwlts.runtime.compiled import compiled_part
 
 CALLER = """\
 from uwlts.runtime.compiled import compiled
-from {}.called import factor
+from inner.called import part as near
+from beside.called import part
+from beside.called import inline
 
 @compiled
-def scaled(x):
-    return factor() * x
+def by_near(x):
+    return near() * x
 
-print(scaled(2.0), sum(scaled.stats.cache_hits.values()))
+@compiled
+def by_part(x):
+    return part() * x
+
+@compiled
+def by_inline(x):
+    return inline() * x
+
+for each in (by_near, by_part, by_inline):
+    print(each(2.0), sum(each.stats.cache_hits.values()))
 """
 CALLED = """\
-from uwlts.runtime.compiled import {0}
+from uwlts.runtime.compiled import compiled_inline, compiled_part
 
-@{0}
-def factor():
-    return {1}
+@compiled_part
+def part():
+    return {0}
+
+@compiled_inline
+def inline():
+    return {0}
 """
 
 
 def run(folder: Path) -> list[str]:
     code = f"import sys; sys.path.insert(0, {str(folder)!r}); import inner.caller"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    return done.stdout.split()
+    return done.stdout.splitlines()
 
 
-@pytest.mark.parametrize(
-    ("other", "kind"), [("inner", "compiled_part"), ("beside", "compiled_part"), ("beside", "compiled_inline")]
-)
-def test_a_change_in_another_file_that_is_called_is_noticed(tmp_path: Path, other, kind):
+def test_a_change_in_another_file_that_is_called_is_noticed(tmp_path: Path):
+    """In the caller's own package and in another one; a function that is inlined, and one that is not."""
     packages = tmp_path / "uwlts"
     for name in ("inner", "beside"):
         (packages / name).mkdir(parents=True)
         (packages / name / "__init__.py").touch()
-    (packages / "inner" / "caller.py").write_text(CALLER.format(other))
-    called = packages / other / "called.py"
-    called.write_text(CALLED.format(kind, "3.0"))
-    assert run(packages) == ["6.0", "0"]
-    assert run(packages) == ["6.0", "1"]
-    called.write_text(CALLED.format(kind, "50.0"))
-    assert run(packages) == ["100.0", "0"]
+        (packages / name / "called.py").write_text(CALLED.format("3.0"))
+    (packages / "inner" / "caller.py").write_text(CALLER)
+    assert run(packages) == ["6.0 0"] * 3
+    assert run(packages) == ["6.0 1"] * 3
+    # A change in the caller's package is noticed by all; one beside it only by those that call it.
+    (packages / "beside" / "called.py").write_text(CALLED.format("50.0"))
+    assert run(packages) == ["6.0 1", "100.0 0", "100.0 0"]
+    (packages / "inner" / "called.py").write_text(CALLED.format("50.0"))
+    assert run(packages)[0] == "100.0 0"
 
 
 @pytest.mark.parametrize("collects", [True, False])

@@ -60,10 +60,3 @@ def test_parts_are_the_whole(cloud, tmp_path):
         parts = list(read_parts(tmp_path / name, 50_000))
         assert [len(part) for part in parts] == [50_000, 50_000, 20_000]
         np.testing.assert_array_equal(np.concatenate([part.points_mm for part in parts]), cloud.points_mm)
-
-
-def test_empty_clouds_are_not_exported(cloud, tmp_path):
-    cloud.select(slice(0, 0)).save(tmp_path / "empty.ply")
-    with pytest.raises(OutputError, match="no points"):
-        uwlts.export(tmp_path / "empty.ply", tmp_path / "empty.laz")
-    assert [path.name for path in tmp_path.iterdir()] == ["empty.ply"]

@@ -2,6 +2,7 @@
 
 import contextlib
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -56,6 +57,14 @@ def folder_of(tmp_path: Path, images: dict[str, np.ndarray], given: dict | None 
         assert cv2.imwrite(str(folder / name), image)
     (folder / "import.toml").write_text(tomli_w.dumps(GIVEN if given is None else given))
     return folder
+
+
+@contextlib.contextmanager
+def imported(folder: Path, *, overwrite: bool = False) -> Iterator[Capture]:
+    """Import a folder, and open the capture beside it."""
+    import_images(folder, folder.parent / "a.h5", overwrite=overwrite)
+    with Capture(folder.parent / "a.h5") as capture:
+        yield capture
 
 
 def three(tmp_path: Path, given: dict | None = None, **others: np.ndarray) -> Path:
@@ -264,8 +273,7 @@ def test_all_bits_come_in(tmp_path: Path, suffix: str, bits: int, aligned: str):
     image = stripe_image().astype(np.uint16) * 2 ** (bits - 8) + 1
     stored = image * 2 ** (16 - bits) if aligned == "high" else image
     given = without("laser", laser="a*", bits=bits, aligned=aligned)
-    import_images(folder_of(tmp_path, {f"a{suffix}": stored}, given), tmp_path / "a.h5")
-    with Capture(tmp_path / "a.h5") as capture:
+    with imported(folder_of(tmp_path, {f"a{suffix}": stored}, given)) as capture:
         assert (capture.dtype, capture.header.saturation_dn) == (np.uint16, 2**bits - 1)
         assert np.array_equal(capture.image(0), image)
 
@@ -276,8 +284,7 @@ def test_a_background_is_subtracted_with_its_sign(tmp_path: Path):
     images = {f"l{n}.png": image.astype(np.uint8) for n, image in enumerate(lit)}
     images |= {f"w{n}.png": image for n, image in enumerate(dark)}
     given = without("laser", laser="l*", lamp="w*", background="w*")
-    import_images(folder_of(tmp_path, images, given), tmp_path / "a.h5")
-    with Capture(tmp_path / "a.h5") as capture:
+    with imported(folder_of(tmp_path, images, given)) as capture:
         assert (capture.dtype, capture.header.saturation_dn) == (np.uint16, 255 + 256)
         assert "256 added" in capture.header.provenance["background"]
         for index in range(2):
@@ -334,22 +341,14 @@ def test_pixels_clipped_by_the_camera_are_known_in_what_is_calculated(tmp_path: 
     assert len(stripe.lines) > 0.9 * WIDTH and np.abs(stripe.centre_px[stripe.lines] - 25.25).max() < 1.0
 
 
-def test_noise_below_the_background_stays_below(tmp_path: Path):
-    images = {"l.png": stripe_image(seed=1), "dark.png": stripe_image(height=0, seed=2)}
-    import_images(folder_of(tmp_path, images, without("laser", laser="l*", background="dark*")), tmp_path / "a.h5")
-    with Capture(tmp_path / "a.h5") as capture:
-        assert len(capture) == 1
-        assert np.array_equal(capture.image(0).astype(int) - 256, images["l.png"].astype(int) - images["dark.png"])
-        assert capture.image(0).min() < 256
-
-
-def test_ignored_images_are_no_backgrounds(tmp_path: Path):
-    lit = stripe_image()
-    images = {"l1.png": lit, "dark1.png": np.full_like(lit, 7), "dark-spoilt.png": np.full_like(lit, 90)}
+def test_noise_below_the_background_stays_below_and_ignored_images_are_none(tmp_path: Path):
+    images = {"l1.png": stripe_image(seed=1), "dark1.png": stripe_image(height=0, seed=2)}
+    images["dark-spoilt.png"] = np.full(SHAPE, 90, np.uint8)
     given = without("laser", laser="l*", background="dark*", ignore="*spoilt*")
-    import_images(folder_of(tmp_path, images, given), tmp_path / "a.h5")
-    with Capture(tmp_path / "a.h5") as capture:
-        assert np.array_equal(capture.image(0), lit.astype(int) - 7 + 256)
+    with imported(folder_of(tmp_path, images, given)) as capture:
+        assert len(capture) == 1
+        difference = capture.image(0).astype(int) - 256
+        assert np.array_equal(difference, images["l1.png"].astype(int) - images["dark1.png"]) and difference.min() < 0
 
 
 def test_images_are_taken_as_stored_whatever_exif_says(tmp_path: Path):
@@ -368,13 +367,11 @@ def test_images_are_taken_as_stored_whatever_exif_says(tmp_path: Path):
 def test_free_poses_count_the_images(tmp_path: Path):
     given = without("laser", "stage", laser="l*", lamp="w*", stage={"free": True})
     folder = three(tmp_path, given, w1=lamp_image(1), w2=lamp_image(2), w3=lamp_image(3))
-    import_images(folder, tmp_path / "a.h5")
-    with Capture(tmp_path / "a.h5") as capture:
+    with imported(folder) as capture:
         assert capture.stage_mm.tolist() == [0.0, 0.0, 1.0, 1.0, 2.0, 2.0]
         assert capture.header.provenance["stage"] == NO_STAGE
     folder_of(tmp_path, {}, given | {"provenance": {"operator": "me"}})
-    import_images(folder, tmp_path / "a.h5", overwrite=True)
-    with Capture(tmp_path / "a.h5") as capture:
+    with imported(folder, overwrite=True) as capture:
         assert capture.header.provenance == {"operator": "me", "stage": NO_STAGE}
 
 
@@ -415,8 +412,7 @@ def test_the_table_names_backgrounds(tmp_path: Path):
     given = without("laser", table="each.csv", stage={"positions_mm": [1.0, 2.0], "direction": [0.0, 0.0, 1.0]})
     folder = three(tmp_path, given, dark=stripe_image(height=0, dark=4))
     (folder / "each.csv").write_text("file,light,background\nl1.png,laser,dark.png\nl2.png,laser,dark.png\n")
-    import_images(folder, tmp_path / "a.h5")
-    with Capture(tmp_path / "a.h5") as capture:
+    with imported(folder) as capture:
         assert capture.stage_mm.tolist() == [1.0, 2.0] and np.median(capture.image(0)) == pytest.approx(256 + 6, abs=1)
 
 
@@ -430,8 +426,7 @@ def test_intrinsics_fill_the_sensor(tmp_path: Path):
     storage.write("camera_matrix", matrix)
     storage.write("distortion_coefficients", coefficients)
     storage.release()
-    import_images(folder, tmp_path / "a.h5")
-    with Capture(tmp_path / "a.h5") as capture:
+    with imported(folder) as capture:
         camera = capture.header.sensor.camera
     assert camera.focal_length_px() == pytest.approx(2002.0, rel=1e-12)
     assert camera.principal_point() == (50.0, 31.0)
@@ -519,26 +514,31 @@ def test_all_black(tmp_path: Path):
     refused(folder_of(tmp_path, images, given), tmp_path, ImageError, "all 2 lamp images are black")
 
 
-def test_one_black_image_is_reported(tmp_path: Path):
-    imported = import_images(three(tmp_path, l2=np.zeros((HEIGHT, WIDTH), np.uint8)), tmp_path / "a.h5")
-    assert imported.warnings[0] == "1 of 3 laser images are black, such as l2.png"
+def stripes(count: int, **options) -> list[np.ndarray]:
+    return [stripe_image(20.0 + number, seed=number, **options) for number in range(count)]
 
 
-def test_without_stripe_is_reported_and_imported(tmp_path: Path):
-    folder = folder_of(tmp_path, {f"l{n}.png": stripe_image(height=0, dark=40, seed=n) for n in (1, 2)})
+@pytest.mark.parametrize(
+    ("images", "camera", "words"),
+    [
+        ([*stripes(2), np.zeros(SHAPE, np.uint8)], {}, "1 of 3 laser images are black, such as l2.png"),
+        (stripes(2, height=0, dark=40), {}, "no stripe in any of the 2 laser images"),
+        (
+            [np.pad(stripe_image()[:, :80].T, ((0, 0), (8, 8)), "reflect")],
+            {"width_px": 80, "height_px": 80},
+            "one runs across: the images are rotated, or the sensor's stripe_along",
+        ),
+        ([255 - image for image in stripes(3)], {}, "are their grey values inverted?"),
+    ],
+    ids=["black", "no stripe", "across", "inverted"],
+)
+def test_images_that_show_no_stripe_are_imported_and_named(tmp_path: Path, images, camera, words: str):
+    given = GIVEN | {"sensor": SENSOR | {"camera": SENSOR["camera"] | camera}}
+    folder = folder_of(tmp_path, {f"l{number}.png": image for number, image in enumerate(images)}, given)
     warnings = import_images(folder, tmp_path / "a.h5").warnings
-    assert len(warnings) == 1 and "no stripe in any of the 2 laser images" in warnings[0]
+    assert words in warnings[0] and (len(warnings) == 1 or len(images) == 1 or "black" in words)
     with Capture(tmp_path / "a.h5") as capture:
-        assert len(capture) == 2
-
-
-def test_a_stripe_across_is_reported(tmp_path: Path):
-    square = {"width_px": 80, "height_px": 80}
-    sensor = SENSOR | {"camera": SENSOR["camera"] | square}
-    image = stripe_image()[:, :80].T
-    folder = folder_of(tmp_path, {"l1.png": np.pad(image, ((0, 0), (8, 8)), "reflect")}, GIVEN | {"sensor": sensor})
-    warnings = import_images(folder, tmp_path / "a.h5").warnings
-    assert "one runs across: the images are rotated, or the sensor's stripe_along" in warnings[0]
+        assert len(capture) == len(images)
 
 
 def test_several_pages_and_floating_point(tmp_path: Path):
@@ -674,14 +674,6 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
 def test_a_formula_leaves_lamp_images_grey(tmp_path: Path):
     colours = np.dstack([lamp_image(1), lamp_image(2), np.maximum(lamp_image(3), stripe_image())])
     given = without("laser", laser="*.png", lamp="*.png", channel="red - max(green, blue)")
-    folder = folder_of(tmp_path, {"a1.png": colours, "a2.png": colours[::-1]}, given)
-    import_images(folder, tmp_path / "a.h5")
-    with Capture(tmp_path / "a.h5") as capture:
+    with imported(folder_of(tmp_path, {"a1.png": colours, "a2.png": colours[::-1]}, given)) as capture:
         assert np.array_equal(capture.image(0), cv2.cvtColor(colours, cv2.COLOR_BGR2GRAY)) and not capture.laser_on[0]
         assert "not known" in capture.header.provenance["response"]
-
-
-def test_inverted_grey_values_are_named(tmp_path: Path):
-    folder = folder_of(tmp_path, {f"l{n}.png": 255 - stripe_image(20.0 + n, seed=n) for n in range(3)})
-    (warning,) = import_images(folder, tmp_path / "a.h5").warnings
-    assert "are their grey values inverted?" in warning

@@ -102,14 +102,6 @@ def test_laz_has_time_image_and_covariance(cloud, tmp_path):
     assert_same(cloud, table | {a: (1e-3 * cloud.points_mm)[:, k] for k, a in enumerate("xyz")})
 
 
-def test_ply_has_time_image_and_covariance(cloud, tmp_path):
-    cloud.save(tmp_path / "a.full.ply")
-    again = uwlts.read(tmp_path / "a.full.ply")
-    np.testing.assert_array_equal(again.time_s, cloud.time_s)
-    np.testing.assert_array_equal(again.frame, cloud.frame)
-    np.testing.assert_allclose(again.covariance_mm2, cloud.covariance_mm2, rtol=1e-6)
-
-
 def test_times_before_zero_are_refused(cloud, tmp_path):
     early = PointCloud(cloud.points_mm, cloud.intensity, cloud.frame, cloud.line, time_s=cloud.time_s - 2e9)
     with pytest.raises(uwlts.Error, match="no time before 0"):

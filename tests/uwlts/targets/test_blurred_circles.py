@@ -1,6 +1,7 @@
 """Circles out of focus: found and centred, with a longer reach across the edge if the short one fails."""
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
@@ -20,11 +21,13 @@ def places():
     return lattice + np.random.default_rng(0).uniform(-0.5, 0.5, lattice.shape)
 
 
+@cache
 def sharp(radius):
     """Return the covered fraction of a point (u, v) relative to the circle's centre: 0 or 1."""
     return lambda u, v: (np.hypot(u, v) < radius).astype(float)
 
 
+@cache
 def blurred(radius, blur):
     """Return the fraction of a disc of radius ``blur`` covered by a larger disc: the area of their intersection."""
 
@@ -46,6 +49,7 @@ def in_steps(radius, blur, count):
     return lambda u, v: sum(sharp(radius)(u - a, v - b) for a, b in points) / count
 
 
+@cache
 def on_an_inclined_plate(radius, blur, growth, *, count=100):
     """Return the same for a blur radius that increases by ``growth`` per pixel along v; each point keeps its light."""
     turn = np.arange(count) * np.pi * (3 - math.sqrt(5))
@@ -63,16 +67,23 @@ def on_an_inclined_plate(radius, blur, growth, *, count=100):
     return share
 
 
-def photograph(share, *, samples, bright=True, noise=0.0, shading=0.0):
-    """Return an image of the lattice: pixels are means of samples x samples points, with ``shading`` per pixel of u."""
+@cache
+def covered(share, samples):
+    """Return the covered fraction of each pixel: the mean of samples x samples points of it."""
     image, side = np.zeros(SHAPE), 2 * (SPACING // 2)
     within = (np.arange(side)[:, None] + (np.arange(samples) + 0.5) / samples - 0.5).ravel()
     for cu, cv in places():
         u0, v0 = round(cu) - side // 2, round(cv) - side // 2
         fine = share(within + u0 - cu, (within + v0 - cv)[:, None])
         image[v0 : v0 + side, u0 : u0 + side] = fine.reshape(side, samples, side, samples).mean((1, 3))
+    return image
+
+
+def photograph(share, *, samples, bright=True, noise=0.0, shading=0.0):
+    """Return an image of the lattice, with ``shading`` per pixel of u."""
+    image = covered(share, samples)
     levels = DARK + (BRIGHT - DARK) * (image if bright else 1 - image)
-    levels *= 1 + shading * (np.arange(SHAPE[1]) - SHAPE[1] / 2)
+    levels = levels * (1 + shading * (np.arange(SHAPE[1]) - SHAPE[1] / 2))
     return np.clip(np.rint(levels + noise * np.random.default_rng(1).normal(size=SHAPE)), 0, 255).astype(np.uint8)
 
 

@@ -1,6 +1,6 @@
 """Circle grids without marks, drawn ray by ray: their numbers, their centres, and what is refused."""
 
-from functools import partial
+from functools import cache, partial
 
 import cv2
 import numpy as np
@@ -75,6 +75,12 @@ def test_x_points_right_where_half_a_turn_changes_nothing(turn):
     assert errors_px(view, RECTANGULAR, place, points).max() < 0.1
 
 
+@cache
+def rectangular_photograph(hidden):
+    place = pose((0.0, 10.0, 5.0), (-40.0, -25.0, 150.0))
+    return photograph(RECTANGULAR.points_mm[:, :2], 6.0, place, hidden=list(hidden))
+
+
 @pytest.mark.parametrize(
     ("described", "hidden", "said"),
     [
@@ -85,9 +91,8 @@ def test_x_points_right_where_half_a_turn_changes_nothing(turn):
     ],
 )
 def test_another_grid_is_refused_with_the_reason(described, hidden, said):
-    place = pose((0.0, 10.0, 5.0), (-40.0, -25.0, 150.0))
     with pytest.raises(TargetError, match=said):
-        described.detect(photograph(RECTANGULAR.points_mm[:, :2], 6.0, place, hidden=list(hidden)))
+        described.detect(rectangular_photograph(hidden))
 
 
 def test_descriptions_that_contradict_themselves_are_refused():

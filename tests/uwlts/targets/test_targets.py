@@ -381,28 +381,18 @@ def test_descriptions_are_read_with_their_defaults():
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"kind": "dots"}, "kind is one of"),
-        ({"spacing_mm": 9}, "spacing_mm is not a key"),
-        ({"columns": None}, "columns: .* found None"),
-        ({"diameter_mm": 9.4}, "circles touch"),
-        ({"diameter_mm": float("inf")}, "diameter_mm"),
-        ({"diameter_mm": -1.0}, "greater than 0"),
-        ({"marker_diameter_mm": 5.0}, "less than diameter_mm"),
-        ({"origin": [14, 5]}, "marker_x is at"),
-        ({"origin": [15, 5]}, "origin is at"),
-        ({"marker_y": [4, 0]}, "collinear"),
-    ],
-)
-def test_impossible_circle_targets_are_refused(change, message):
-    with pytest.raises(DescriptionError, match=message):
-        parse_target(COMPLETE | change)
-
-
-@pytest.mark.parametrize(
     ("mapping", "message"),
     [
+        (COMPLETE | {"kind": "dots"}, "kind is one of"),
+        (COMPLETE | {"spacing_mm": 9}, "spacing_mm is not a key"),
+        (COMPLETE | {"columns": None}, "columns: .* found None"),
+        (COMPLETE | {"diameter_mm": 9.4}, "circles touch"),
+        (COMPLETE | {"diameter_mm": float("inf")}, "diameter_mm"),
+        (COMPLETE | {"diameter_mm": -1.0}, "greater than 0"),
+        (COMPLETE | {"marker_diameter_mm": 5.0}, "less than diameter_mm"),
+        (COMPLETE | {"origin": [14, 5]}, "marker_x is at"),
+        (COMPLETE | {"origin": [15, 5]}, "origin is at"),
+        (COMPLETE | {"marker_y": [4, 0]}, "collinear"),
         ({}, "kind is one of"),
         ([], "expected a table"),
         ({"kind": "chessboard", "columns": 8, "rows": 5}, "square_mm is missing"),
@@ -412,7 +402,7 @@ def test_impossible_circle_targets_are_refused(change, message):
         (CHARUCO.model_dump() | {"columns": 30, "rows": 20}, "needs 300 markers"),
     ],
 )
-def test_impossible_boards_are_refused(mapping, message):
+def test_impossible_targets_are_refused(mapping, message):
     with pytest.raises(DescriptionError, match=message):
         parse_target(mapping)
 

@@ -43,9 +43,12 @@ def lens(images, *, distortion="auto", pixels="auto", **options):
 @pytest.mark.parametrize(
     ("optics", "needed"),
     [
-        ({"distortion": (-0.2, 0.3, 0.0, 0.0, 0.0)}, {"k1", "k2"}),
         ({"distortion": (-0.2, 0.3, 0.0, -0.008, 0.0)}, {"k1", "k2", "p1", "p2"}),
-        ({"fy": 1.002 * F, "distortion": (-0.2, 0.3, 0.0, 0.0, 0.0)}, {"fx", "fy", "k1", "k2"}),
+        pytest.param(
+            {"fy": 1.002 * F, "distortion": (-0.2, 0.3, 0.0, 0.0, 0.0)},
+            {"fx", "fy", "k1", "k2"},
+            marks=pytest.mark.slow,
+        ),
         pytest.param({"distortion": (-0.35, 0.5, 0.0, 0.0, -5.0)}, {"k1", "k2", "k3"}, marks=pytest.mark.slow),
         # Nearly f times the angle, as wide lenses see: Pade's approximation of the arctangent.
         pytest.param(
@@ -56,7 +59,7 @@ def lens(images, *, distortion="auto", pixels="auto", **options):
     ],
 )
 def test_the_lens_is_found_without_the_user_knowing(optics, needed):
-    found = lens(views(3, **optics))
+    found = lens(views(3, count=12, **optics))
     taken = next(each for each in found.candidates if each.options == found.options)
     assert needed <= set(found.solution.parameters)
     assert taken.rms_px <= 1.05 * np.nanmin([each.rms_px for each in found.candidates])
@@ -115,13 +118,13 @@ def test_an_image_of_another_board_is_left_out_and_named():
 def test_an_image_that_alone_decides_is_left_out_and_named():
     """The board is 0.6 % wider in its only tilted image: this image was left out in ten of ten draws."""
     reasons = []
-    for seed in range(20, 26):
+    for seed in range(20, 23):
         images = views(seed, count=19, tilt=0.1) + views(seed + 50, count=1, tilt=0.6)
         images[19] = replace(images[19], points_mm=images[19].points_mm * [1.006, 1.0, 1.0])
         found = lens(images, distortion=("k1", "k2"), pixels="square")
         assert set(found.left_out) <= {19}
         reasons += [reason for reason in found.left_out.values() if "standard uncertainties" in reason]
-    assert len(reasons) >= 4
+    assert len(reasons) >= 2
 
 
 def test_halves_are_doubted_beyond_four_standard_deviations_of_their_difference():
@@ -137,7 +140,7 @@ def test_halves_are_doubted_beyond_four_standard_deviations_of_their_difference(
 def test_halves_of_the_images_by_another_focal_length_are_noticed():
     """The lens was zoomed between images: leaving out images states only a sixth of the halves' difference."""
     same, zoomed = views(8, count=18), views(9, count=18, fx=1.02 * F, fy=1.02 * F)
-    alike = lens(views(8, count=36), distortion=("k1", "k2"), pixels="square")
+    alike = lens(views(8, count=26), distortion=("k1", "k2"), pixels="square")
     assert alike.half_doubts() == []
     one, two = alike.half_values()
     assert one["f"] != two["f"] and max(abs(each["f"] - F) for each in (one, two)) < 5 * 1.5 * alike.std()["f"]
@@ -162,13 +165,13 @@ def test_misplaced_points_are_left_out():
 def test_stated_uncertainties_hold_where_the_misses_of_an_image_go_together():
     """Boards have a different bow in every image, so the errors of their points are correlated."""
     errors, stated, independent = [], [], []
-    for seed in range(15):
-        found = lens(views(100 + seed, count=12, bent=0.15), distortion=("k1", "k2"), pixels="square")
+    for seed in range(10):
+        found = lens(views(100 + seed, count=10, bent=0.15), distortion=("k1", "k2"), pixels="square")
         errors.append(found.solution.model.fx_px - F)
         stated.append(found.std()["f"])
         independent.append(found.solution.std()["f"])
-    # The mean square of 15 normal numbers is between 0.16 and 3.0 except once in ten thousand times. The standard
-    # uncertainties, from twelve images each, scatter by a fifth as well: 1.7 was measured, 12 by independent points.
+    # The mean square of 10 normal numbers is between 0.16 and 2.96 except twice in a thousand times. The standard
+    # uncertainties, from ten images each, scatter by a fifth as well. By independent points it is some 12.
     ratio = np.mean((np.array(errors) / stated) ** 2)
     assert 0.2 < ratio < 4.0
     assert np.mean((np.array(errors) / independent) ** 2) > 2 * ratio
@@ -197,10 +200,9 @@ def wide_views(count, *, noise_px=0.05):
     return images
 
 
-@pytest.mark.parametrize("count", [5, pytest.param(12, marks=pytest.mark.slow)])
-def test_a_wide_lens_gets_a_model_that_follows_it(count):
+def test_a_wide_lens_gets_a_model_that_follows_it():
     """Five images are too few for a comparison of models; k1 k2 leaves more than a pixel."""
-    found = lens(wide_views(count), pixels="square")
+    found = lens(wide_views(5), pixels="square")
     assert {"k1", "k2", "k4", "k5"} <= set(found.options.distortion) and not found.left_out
     assert found.widest_deg() > 55 and found.solution.rms_px() < 0.08
     assert abs(found.solution.model.fx_px - 436.0) < 4 * found.std()["f"] < 4.0

@@ -18,7 +18,7 @@ from uwlts.calibration.camera.camera_parameters import (
 )
 from uwlts.calibration.camera.target_poses import direct_linear, solve_camera, stage_direction
 from uwlts.errors import CalibrationError, DescriptionError
-from uwlts.fitting.schur_least_squares import Observation, schur_least_squares
+from uwlts.fitting.schur_least_squares import schur_least_squares
 
 SENSOR = built_sensor()
 LENS = lens_of(SENSOR)
@@ -173,18 +173,6 @@ def test_errors_follow_the_reported_covariance(poses):
     assert abs(np.mean(scores) - 5) < 2.3
     # Each sigma comes from at least 900 residuals: 2.4 %, the mean of 30 0.43 %; 4 std.
     assert np.mean(sigmas) == pytest.approx(noise, rel=0.017)
-
-
-def test_thesis_numbers():
-    images, true_poses, direction = stage_images(SENSOR, noise_px=0.05, rng=np.random.default_rng(1))
-    assert len(images) == 31
-    solution = solve_camera(images, **SIZE)
-    # Four of the reported standard deviations, which another test confirms.
-    assert np.all(np.abs(found(solution) - TRUE) < 4 * np.sqrt(np.diag(solution.covariance)))
-    assert solution.std()["f"] < 0.03
-    assert np.abs(solution.target_poses - true_poses)[:, :3, 3].max() < 0.02
-    np.testing.assert_allclose(solution.stage_direction, direction, atol=1e-4)
-    assert solution.rms_px() == pytest.approx(0.05 * np.sqrt(2), rel=0.02)
 
 
 def test_free_poses_agree_with_opencv():
@@ -367,31 +355,6 @@ def test_unusable_target_images_are_refused():
         TargetImage(points + [0, 0, 1], pixels)
     with pytest.raises(ValueError, match="expected"):
         TargetImage(points, pixels[:-1])
-
-
-def test_grouped_least_squares_against_one_big_system():
-    rng = np.random.default_rng(9)
-    designs = [(rng.normal(size=(20, 3)), rng.normal(size=(20, 2))) for _ in range(4)]
-    values = [rng.normal(size=20) for _ in designs]
-
-    def model(group, global_values, local):
-        by_global, by_local = designs[group]
-        return Observation(
-            (values[group] - by_global @ global_values - by_local @ local).reshape(-1, 2), -by_global, -by_local
-        )
-
-    fit = schur_least_squares(model, np.zeros(3), [np.zeros(2)] * 4)
-    whole = np.zeros((80, 11))
-    for group, (by_global, by_local) in enumerate(designs):
-        rows = slice(20 * group, 20 * group + 20)
-        whole[rows, :3], whole[rows, 3 + 2 * group : 5 + 2 * group] = by_global, by_local
-    solution, squares, _, _ = np.linalg.lstsq(whole, np.concatenate(values))
-    np.testing.assert_allclose(np.r_[fit.global_values, np.concatenate(fit.local)], solution, atol=1e-7)
-    covariance = squares[0] / (80 - 11) * np.linalg.inv(whole.T @ whole)
-    np.testing.assert_allclose(fit.covariance, covariance[:3, :3], rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(fit.local_covariances[2], covariance[7:9, 7:9], rtol=1e-6, atol=1e-9)
-    with pytest.raises(CalibrationError, match="behind"):
-        schur_least_squares(lambda *_: None, np.zeros(3), [np.zeros(2)])
 
 
 def test_start_values_are_those_of_the_camera_matrix():

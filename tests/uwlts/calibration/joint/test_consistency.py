@@ -22,6 +22,7 @@ pytestmark = pytest.mark.slow
 
 BUILT = built_sensor()
 OPTIONS = CalibrationOptions(poses="stage", correct_circles=False)
+ANY_LENS = LensChoice()
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +36,7 @@ def views():
     noise = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(8))
     air = target_series(BUILT, window=False, positions=np.arange(8) * 35.0 - 200.0, noise=noise, columns=17)
     water = target_series(BUILT, medium=0, positions=np.arange(8) * 25.0 - 120.0, noise=noise, columns=17)
-    return named(air, "air.h5"), named(water, "water.h5")
+    return named(edited(air, every=2), "air.h5"), named(edited(water, every=2), "water.h5")
 
 
 def named(series, name):
@@ -48,10 +49,10 @@ def stripes_edited(series, edit):
     return replace(series, found=replace(series.found, stripes=stripes))
 
 
-def refusal(evidence, *, strict=False):
-    """Return the reason for rejected evidence, with all lens models and rejection of images allowed."""
+def refusal(evidence, *, strict=False, lens=ANY_LENS):
+    """Return the reason for rejected evidence, with rejection of images and, by default, all lens models allowed."""
     with pytest.raises(CalibrationError) as error:
-        solve_jointly(evidence, options=replace(OPTIONS, lens=LensChoice(), strict=strict))
+        solve_jointly(evidence, options=replace(OPTIONS, lens=lens, strict=strict))
     return str(error.value).splitlines()[0]
 
 
@@ -135,29 +136,14 @@ def test_what_the_model_lacks_makes_uncertainties_larger(views, thesis):
     assert np.abs(pulls(result)).max() < 4.5
 
 
-@pytest.mark.parametrize(
-    ("focal_length_mm", "distortion", "given"), [(8.0, {"k3": 1.5}, "k3"), (12.93, {"p1": -0.008}, "p1, p2")]
-)
-def test_distortion_that_a_lens_has_besides_is_found(thesis, focal_length_mm, distortion, given):
-    """A wide lens with more than a pixel of residual distortion in the corners after k1 and k2; a lens off centre."""
-    lens = altered(BUILT, {"camera": {"focal_length_mm": focal_length_mm, "distortion": distortion}})
-    described = altered(thesis, {"camera": {"focal_length_mm": focal_length_mm}})
+def test_distortion_that_a_lens_has_besides_is_found(thesis):
+    """A wide lens with more than a pixel of residual distortion in the corners after k1 and k2."""
+    lens = altered(BUILT, {"camera": {"focal_length_mm": 8.0, "distortion": {"k3": 1.5}}})
+    described = altered(thesis, {"camera": {"focal_length_mm": 8.0}})
     noise = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(8))
     air = target_series(lens, window=False, positions=np.arange(8) * 35.0 - 200.0, noise=noise, columns=17)
-    result = solve_jointly(gathered(described, [air]), options=replace(OPTIONS, lens=LensChoice()))
-    assert any(f"{given} were added to the lens:" in said for said in result.warnings)
-    assert lens_pulls(result, lens).max() < 4.5
-
-
-def test_everything_that_a_lens_has_besides_is_found_by_hand(thesis):
-    """Pixels that are not square among it, which images show if the target is held by hand at several tilts."""
-    wide = {"camera": {"focal_length_mm": 8.0, "pixel_aspect": 1.003, "distortion": {"k3": 1.5, "p1": 0.003}}}
-    lens, described = altered(BUILT, wide), altered(thesis, {"camera": {"focal_length_mm": 8.0}})
-    rng = np.random.default_rng(8)
-    noise, tilts = Noise(circles_px=0.03, stripe_px=0.1, rng=rng), rng.uniform(-0.3, 0.3, (10, 2))
-    air = target_series(lens, window=False, positions=np.arange(10.0), noise=noise, columns=17, tilts=tilts)
-    result = solve_jointly(gathered(described, [air]), options=replace(OPTIONS, poses="free", lens=LensChoice()))
-    assert any("p1, p2, k3, free pixels were added to the lens:" in said for said in result.warnings)
+    result = solve_jointly(gathered(described, [edited(air, every=4)]), options=replace(OPTIONS, lens=LensChoice()))
+    assert any("k3 were added to the lens:" in said for said in result.warnings)
     assert lens_pulls(result, lens).max() < 4.5
 
 
@@ -171,7 +157,8 @@ def test_a_lens_other_than_in_water_is_refused(views, thesis):
         noise=noise,
         columns=17,
     )
-    assert "contradicts itself" in refusal(gathered(thesis, [other, views[1]]))
+    usual = LensChoice(("k1", "k2"), "square")
+    assert "contradicts itself" in refusal(gathered(thesis, [edited(other, every=2), views[1]]), lens=usual)
 
 
 def test_a_water_image_said_to_be_in_air_shows_in_the_focal_length(views, thesis):
@@ -190,32 +177,6 @@ def test_a_wrong_index_is_refused(views, thesis):
     said = refusal(evidence)
     assert "index of water found 1.33" in said
     assert "described as 1.34500 +- 0.0001" in said
-
-
-def with_window(sensor, **figures):
-    window = sensor.camera.window.model_copy(update=figures)
-    return sensor.model_copy(update={"camera": sensor.camera.model_copy(update={"window": window})})
-
-
-def test_a_window_far_from_its_drawing_is_refused_and_one_not_so_far_is_doubted(views, thesis):
-    """It stands at 47.3 mm; its distance is known to 5 mm before, so 85 is 7.5 and 70 is 4.5 times that away."""
-    said = refusal(gathered(with_window(thesis, distance_mm=85.0), views))
-    assert "window distance found 47.3, described as 85.0 +- 5" in said
-    doubts = solve_jointly(gathered(with_window(thesis, distance_mm=70.0), views), options=OPTIONS).warnings
-    assert [doubt for doubt in doubts if doubt.startswith("window distance found 47.3, described as 70.0")]
-
-
-def test_a_noisy_stripe_is_doubted_and_not_refused(views, thesis):
-    """0.6 px of noise in one of 16 stripes: six times the others'; no contradiction, as it varies from line to line."""
-    rng = np.random.default_rng(0)
-
-    def noisy(number, pixels):
-        pixels[:, 1] += rng.normal(0, 0.6, len(pixels)) if number == 2 else 0.0
-        return pixels
-
-    doubts = solve_jointly(gathered(thesis, [stripes_edited(views[0], noisy), views[1]]), options=OPTIONS).warnings
-    assert len(doubts) == 1
-    assert "air.h5, frame 2: the stripe on the target is 0." in doubts[0]
 
 
 def test_reflections_on_a_third_of_the_lines_are_left_out_with_a_word(views, thesis):
@@ -241,7 +202,7 @@ def test_a_lens_in_the_water_is_not_mixed_with_one_behind_a_window(views, thesis
 
 def test_a_lens_that_looks_straight_into_water_is_calibrated_for_it(thesis):
     noise = Noise(circles_px=0.03, stripe_px=0.1, rng=np.random.default_rng(1))
-    series = target_series(BUILT, window=False, positions=np.arange(8) * 35.0 - 200.0, noise=noise, columns=17)
+    series = target_series(BUILT, window=False, positions=np.arange(8) * 35.0 - 200.0, noise=noise, columns=11)
     result = solve_jointly(gathered(thesis, [replace(series, view=ViewMedium(False, 0))]), options=OPTIONS)
     assert result.calibration.window is None
     assert result.calibration.medium_kind == "custom"

@@ -104,17 +104,6 @@ def largest_length_std(calibration):
     return compute_mesh_lengths(known, region).std_mm(known.covariance).max()
 
 
-def length_error(calibration):
-    """Return the width error of a plane 80 mm beyond the stand-off in the cold water, mm."""
-    frame = camera_from_object(BUILT)
-    lit = lit_points(BUILT, normal=frame[:3, 2], point=frame[:3, 3] + 80.0 * frame[:3, 2], index=INDEX)[[20, -21]]
-    pixels = seen(BUILT, lit, index=INDEX, window=True)
-    found = reconstruct_pixels(
-        calibration, pixels, medium_index=calibration.medium_index(WARM), stage_mm=0.0, stage_direction=np.eye(3)[0]
-    ).points_mm
-    return abs(np.linalg.norm(found[1] - found[0]) - np.linalg.norm(lit[1] - lit[0]))
-
-
 def test_one_step_gives_the_index_of_colder_water(earlier, thesis):
     """Water of 18 degC described as 25 degC: an index error of 6.4e-4. An image of 23 mm known to 1 um gives it to
     4e-4.
@@ -166,31 +155,6 @@ def test_water_whose_steps_are_left_out_is_not_said_to_be_measured(earlier, thes
     assert index_in(result.calibration, "pool")[1] == pytest.approx(POORLY_KNOWN)
     assert index_in(result.calibration)[1] < 0.6 * POORLY_KNOWN
     assert "step: left out" in result.warnings[0]
-
-
-def test_steps_near_and_far_bring_lengths_back(earlier, thesis):
-    near_and_far = steps(with_fine_target(thesis), depths_mm=(-45.0, -15.0, 15.0, 60.0, 85.0))
-    result = refreshed(earlier, near_and_far, index_std=POORLY_KNOWN)
-    index, std = index_in(result.calibration)
-    assert abs(index - INDEX) < 3 * std < 1e-3
-    # With other noise up to 0.49 times.
-    assert length_error(result.calibration) < 0.75 * length_error(earlier)
-
-
-@pytest.mark.slow
-def test_stated_uncertainties_of_the_index_hold(thesis):
-    """Pulls of independent calibrations and steps: the mean square of 5 is within 0.04 and 4.1 (chi2, 99.8 %)."""
-    pulls = []
-    for seed in range(5):
-        result = refreshed(
-            calibrated(thesis, seed=seed, columns=9),
-            steps(thesis, depths_mm=(15.0, 80.0), seed=seed),
-            index_std=POORLY_KNOWN,
-        )
-        index, std = index_in(result.calibration)
-        pulls.append((index - INDEX) / std)
-    # The prior holds the index 6e-4 too low and has its share, a fifth of that, of the square.
-    assert 0.04 < np.mean(np.square(pulls)) < 4.5
 
 
 def test_a_prior_with_correlations_counts_as_its_covariance():

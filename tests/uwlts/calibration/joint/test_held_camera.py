@@ -43,10 +43,10 @@ def drawn(seed, kind):
     return real, described, edited(series, every=4), options
 
 
-@pytest.mark.parametrize("kind", ["water", "air", "by hand"])
-def test_a_held_camera_stays_and_the_rest_is_found(kind):
+@pytest.mark.parametrize(("kind", "draws"), [("water", 6), ("air", 2), ("by hand", 2)])
+def test_a_held_camera_stays_and_the_rest_is_found(kind, draws):
     pulls = []
-    for seed in range(6):
+    for seed in range(draws):
         real, described, series, options = drawn(seed, kind)
         result = solve_jointly(gathered(described, [series]), options=options)
         camera, std = result.calibration.camera, result.estimate.std()
@@ -64,7 +64,7 @@ def test_a_held_camera_stays_and_the_rest_is_found(kind):
     assert not pulls or np.mean(np.square(pulls)) < 3.0
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_another_camera_than_the_held_one_is_noticed(seed):
     """Off by 2 % in focal length, or by 40 px in its centre, as if it was focused or cropped afterwards."""
     _, described, series, options = drawn(seed, "by hand")

@@ -61,32 +61,25 @@ def stretched(image, columns):
 def target_in_air_and_water(sensor, *, columns_wider=1.0):
     """Four images each of a target whose described column spacing is too large by a factor."""
     noise = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(8))
-    air = target_series(sensor, window=False, positions=np.linspace(-200.0, 60.0, 4), noise=noise, columns=13)
-    water = target_series(sensor, medium=0, positions=np.linspace(-120.0, 60.0, 4), noise=noise, columns=13)
+    air = target_series(sensor, window=False, positions=np.linspace(-200.0, 60.0, 4), noise=noise, columns=9)
+    water = target_series(sensor, medium=0, positions=np.linspace(-120.0, 60.0, 4), noise=noise, columns=9)
     return [edited(each, lambda _, image: stretched(image, columns_wider), every=4) for each in (air, water)]
 
 
-@pytest.mark.parametrize(
-    ("aspect", "columns_wider", "alignment_deg"),
-    [
-        (1.003, 1.0, 0.4),
-        (1.0, 1.003, 0.15),
-        pytest.param(1.003, 1.0, 0.15, marks=pytest.mark.slow),
-        pytest.param(1.0, 1.003, 0.4, marks=pytest.mark.slow),
-    ],
-)
-def test_pixels_of_another_shape_look_like_a_stretched_target(thesis, aspect, columns_wider, alignment_deg):
+@pytest.mark.slow
+def test_pixels_of_another_shape_look_like_a_stretched_target(thesis):
     """If the stage cannot separate them, both are estimated: the focal lengths are within the stated uncertainties."""
+    aspect = 1.003
     built = altered(BUILT, {"camera": {"pixel_aspect": aspect}})
-    known = altered(thesis, {"uncertainty": {"stage_alignment_deg": alignment_deg}})
-    evidence = gathered(known, target_in_air_and_water(built, columns_wider=columns_wider))
-    result = solve_jointly(evidence, options=OPTIONS)
+    known = altered(thesis, {"uncertainty": {"stage_alignment_deg": 0.4}})
+    result = solve_jointly(gathered(known, target_in_air_and_water(built)), options=OPTIONS)
     assert any("or the pixels' shape is not as described: both are estimated" in said for said in result.warnings)
     camera, std = result.calibration.camera, result.estimate.std()
     assert abs(camera.fx_px - FOCAL_PX) < 4.5 * std[LensParameter.FX]
     assert abs(camera.fy_px - aspect * FOCAL_PX) < 4.5 * std[LensParameter.FY]
 
 
+@pytest.mark.slow
 def test_with_pixels_said_to_be_square_a_wrong_spacing_is_to_be_stated(thesis):
     """0.3 %, thirty times the default: refused or not believed, as no prior knowledge is worth so little."""
     evidence, square = target_in_air_and_water(BUILT, columns_wider=1.003), LensChoice(pixels="square")
@@ -135,8 +128,8 @@ def test_no_window_distance_takes_the_place_of_a_coefficient(thesis, seed):
 
 @pytest.mark.slow
 def test_uncertainties_from_water_alone_contain_the_errors(thesis):
-    """20 lenses and windows, on other seeds: 60 correlated errors; a mean square of one is exceeded by 2 by chance."""
-    square = np.mean([pulls(thesis, seed) ** 2 for seed in range(20, 40)])
+    """Ten lenses and windows, on other seeds: 30 correlated errors; a mean square of one is exceeded by 2 by chance."""
+    square = np.mean([pulls(thesis, seed) ** 2 for seed in range(20, 30)])
     assert 0.4 < square < 2.0
 
 

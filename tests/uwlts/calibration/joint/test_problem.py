@@ -82,6 +82,7 @@ def test_a_tied_parameter_stays_and_its_uncertainty_is_passed_on(problem, solved
         assert found.std()[key] > 0.98 * abs(change)
 
 
+@pytest.mark.slow
 def test_a_stretch_that_halves_of_the_images_disagree_on_is_not_believed(thesis):
     """Of 0.5 % in every second image and none in the others: spacings stay as described, and this is said."""
     result = solve_jointly(gathered(thesis, [series(wider=0.005)]), options=OPTIONS)

@@ -367,6 +367,7 @@ def test_a_wrong_size_without_a_stated_uncertainty_does_no_harm_and_is_told(thes
     np.testing.assert_allclose(result.calibration.camera.fx_px, right.calibration.camera.fx_px, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_what_only_a_known_size_contradicts_it_is_the_cause_of(thesis, target_in_water, monkeypatch):
     """A pipe found 4.5 standard uncertainties too small is a doubt, but not where nothing else explains a misfit."""
     scan = scanned("pipe along", diameter_mm=220.16, **CERTIFIED["pipe along"])

@@ -77,10 +77,7 @@ CASES = [("sphere", True), ("sphere", False), ("plane", True)]
 
 @pytest.mark.parametrize(
     ("kind", "size_known", "seed"),
-    [
-        ("sphere", False, 300),
-        *(pytest.param(*case, seed, marks=pytest.mark.slow) for case in CASES for seed in (301, 302, 303)),
-    ],
+    [("sphere", False, 300), *(pytest.param(*case, 301, marks=pytest.mark.slow) for case in CASES)],
 )
 def test_the_scatter_is_that_of_plain_least_squares(kind, size_known, seed):
     given = draw_set([seed, 1], kind)
@@ -91,10 +88,9 @@ def test_the_scatter_is_that_of_plain_least_squares(kind, size_known, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [310, 311])
-def test_halves_agree_within_what_they_state(seed):
+def test_halves_agree_within_what_they_state():
     """The form error is the same in all profiles; halves cannot show it, but each must state its own scatter."""
-    given = draw_set([seed, 0], "sphere", poses=32, fixed_mm=0.03, **SHORT_ARCS)
+    given = draw_set([310, 0], "sphere", poses=32, fixed_mm=0.03, **SHORT_ARCS)
     one, other = (mount_of(given.select(slice(k, None, 2))) for k in (0, 1))
     apart = differences(one.transform(), other.transform())
     spread = np.array(one.covariance) + np.array(other.covariance)

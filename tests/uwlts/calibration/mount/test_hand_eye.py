@@ -83,13 +83,14 @@ def errors_of(mount):
 def test_the_covariance_is_that_of_the_errors():
     rng = np.random.default_rng(5)
     inside, ratios = [], []
-    for _ in range(20):
+    for _ in range(10):
         estimate, _ = select_agreeing_images(BoardEvidence(simulated(rng), CAMERA, MIDDLE))
         std = np.sqrt(np.diag(estimate.covariance)[:6])
         error = errors_of(estimate.state[0])
         inside.append(np.abs(error) < 2.0 * std)
         ratios.append(error / std)
-    # 120 of them, correlated within a run: six standard deviations of the share are 10 %.
+    # 60 of them, correlated within a run: the share has a standard deviation of 2.8 %, the root mean square of 9 %.
+    # Standard uncertainties that are too small by 1.5 leave 81 % inside.
     assert 0.86 < np.mean(inside) <= 1.0
     assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.35
 
@@ -186,6 +187,7 @@ def test_a_mount_by_a_target_is_that_of_the_true_sheet(thesis, capture_path):
     np.testing.assert_allclose(np.array(mount.covariance) / scale, expected / scale, atol=0.02)
 
 
+@pytest.mark.slow
 def test_wrong_evidence_is_refused(thesis, capture_path):
     calibration = nominal(thesis, medium="water")
     with Capture(capture_path) as capture:

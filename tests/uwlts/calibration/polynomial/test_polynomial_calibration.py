@@ -406,52 +406,38 @@ def test_the_other_kind_is_recognised_by_its_format(tmp_path, sensor):
     assert load_calibration(tmp_path / "rays.json") == rays
 
 
-def edit(content, name):
-    match name:
-        case "newer":
-            content["version"] = 2
-        case "rows":
-            content["depth_coefficients"].pop()
-        case "columns":
-            content["along_coefficients"][3].pop()
-        case "number":
-            content["depth_coefficients"][3][2] = None
-        case "infinite":
-            content["depth_coefficients"][3][2] = float("inf")
-        case "domain":
-            content["domains_px"][3] = [2.0, 1.0]
-        case "range":
-            content["depth_range_mm"] = [5.0, 5.0]
-        case "lines":
-            content["first_line"] = 20
-        case "unknown":
-            content["surprise"] = 1
-        case "format":
-            content["format"] = "something"
-    return content
-
-
 @pytest.mark.parametrize(
-    ("name", "says"),
+    ("damage", "says"),
     [
-        ("newer", "version 2"),
-        ("rows", "depth_coefficients must have"),
-        ("columns", "along_coefficients must have"),
-        ("number", "depth_coefficients.3.2"),
-        ("infinite", "finite"),
-        ("domain", "domains_px"),
-        ("range", "depth_range_mm"),
-        ("lines", "do not fit an image"),
-        ("unknown", "surprise"),
-        ("format", 'expected "format"'),
+        (lambda content: {"version": 2}, "version 2"),
+        (lambda content: {"depth_coefficients": content["depth_coefficients"][:-1]}, "depth_coefficients must have"),
+        (
+            lambda content: {"along_coefficients": with_row(content["along_coefficients"], [0.1])},
+            "along_coefficients must have",
+        ),
+        (
+            lambda content: {"depth_coefficients": with_row(content["depth_coefficients"], [None])},
+            "depth_coefficients.3.0",
+        ),
+        (lambda content: {"depth_coefficients": with_row(content["depth_coefficients"], [float("inf")])}, "finite"),
+        (lambda content: {"domains_px": with_row(content["domains_px"], [2.0, 1.0])}, "domains_px"),
+        (lambda content: {"depth_range_mm": [5.0, 5.0]}, "depth_range_mm"),
+        (lambda content: {"first_line": 20}, "do not fit an image"),
+        (lambda content: {"surprise": 1}, "surprise"),
+        (lambda content: {"format": "something"}, 'expected "format"'),
     ],
 )
-def test_damaged_files(file, name, says):
-    content = edit(json.loads(file.read_text()), name)
+def test_damaged_files(file, damage, says):
+    content = json.loads(file.read_text())
     del content["sha256"]
-    file.write_text(json.dumps(content))
+    file.write_text(json.dumps(content | damage(content)))
     with pytest.raises(CaptureError, match=says):
         load_calibration(file)
+
+
+def with_row(rows, row):
+    """Return the rows with another fourth one."""
+    return [*rows[:3], row, *rows[4:]]
 
 
 def test_files_that_are_none(file, tmp_path):

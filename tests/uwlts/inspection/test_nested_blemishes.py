@@ -1,7 +1,6 @@
-"""Pits in dents and beside them: total and local depth, each blemish once, and no others.
+"""Pits in dents, beside them and touching each other: total and local depth, each blemish once, and no others.
 
-Pipes are those of `tests.oracles.pipes`. Gates on depths are 4.5 standard uncertainties, exceeded by a normal error 7
-times in a million.
+Pipes are those of `tests.oracles.pipes`.
 """
 
 from typing import Literal
@@ -9,20 +8,14 @@ from typing import Literal
 import numpy as np
 import pytest
 
-import uwlts
 from tests.oracles.pipes import Bump, scan_pipe
+from tests.uwlts.inspection.inspected_pipes import BLEMISHES, GATE, HOLLOWS, inspect
 from uwlts.inspection.features import FeatureKind
-from uwlts.storage.cloud import PointCloud
-
-GATE = 4.5
-CASES = [
-    pytest.param(profile, seed, marks=[pytest.mark.slow] if seed > 21 else [])
-    for profile in ("cosine", "bell")
-    for seed in range(21, 23)
-]
 
 
-@pytest.mark.parametrize(("profile", "seed"), CASES)
+@pytest.mark.parametrize(
+    ("profile", "seed"), [("cosine", 21), pytest.param("bell", 22, marks=pytest.mark.slow)], ids=["cosine", "bell"]
+)
 def test_a_pit_in_a_dent_has_its_own_and_its_total_depth(profile: Literal["cosine", "bell"], seed: int) -> None:
     """A dent of 3 to 5.5 % of the radius, at any angle, with a pit in it and one beside it."""
     rng = np.random.default_rng([seed, 6])
@@ -34,11 +27,11 @@ def test_a_pit_in_a_dent_has_its_own_and_its_total_depth(profile: Literal["cosin
         for at in (float(rng.uniform(-5, 5)), 0.5 * size + 0.08 * radius)
     )
     pipe = scan_pipe(
-        rng, axis=(1, 0.2, 0.1), radius_mm=radius, length_mm=2.2 * radius, spacing_mm=0.014 * radius,
+        rng, axis=(1, 0.2, 0.1), radius_mm=radius, length_mm=1.6 * radius, spacing_mm=0.016 * radius,
         bumps=[dent, inner, beside],
     )  # fmt: skip
-    found = uwlts.inspect_pipe(PointCloud(pipe.points_mm, np.ones(len(pipe.points_mm)), pipe.frame, pipe.line))
-    blemishes = found.select(FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION)
+    found = inspect(pipe)
+    blemishes = found.select(*BLEMISHES)
     assert len(blemishes) == 3 and not found.select(FeatureKind.WELD), [each.name for each in blemishes]
     own, *_ = found.select(FeatureKind.DENT)
     pits = {pipe.distance_mm(beside, pit.place_mm) < 0.03 * radius: pit for pit in found.select(FeatureKind.PIT)}
@@ -54,3 +47,29 @@ def test_a_pit_in_a_dent_has_its_own_and_its_total_depth(profile: Literal["cosin
         assert value.value == pytest.approx(truth, abs=GATE * value.uncertainty), value
         assert value.uncertainty < largest * truth
     assert "total depth" not in pits[True]
+
+
+RADIUS_MM, SPACING_MM = 80.0, 1.0
+
+
+@pytest.mark.parametrize("apart", [0.8, 1.05])
+def test_each_of_two_pits_that_touch_has_a_place(apart: float) -> None:
+    """They overlap, or their rims touch; both have 12 mm, and depths of 1.5 and 1.0 mm.
+
+    A single pit beside them has no neighbours. The standard uncertainty of its length is at least that of two
+    rectangular distributions, one spacing wide each.
+    """
+    pits = [Bump(along_mm=at, angle=0.4, diameter_mm=12.0, height_mm=h) for at, h in ((0.0, -1.5), (12 * apart, -1.0))]
+    alone = Bump(along_mm=5.0, angle=-1.0, diameter_mm=14.0, height_mm=-1.2)
+    pipe = scan_pipe(
+        np.random.default_rng([41, 9]), axis=(1, 0.1, 0.2), radius_mm=RADIUS_MM, length_mm=80.0,
+        spacing_mm=SPACING_MM, bumps=[*pits, alone],
+    )  # fmt: skip
+    found = inspect(pipe).select(*HOLLOWS)
+    (single,) = (each for each in found if pipe.distance_mm(alone, each.place_mm) < 2.5)
+    assert not len(single.hollows_mm)
+    assert single["length"].uncertainty >= SPACING_MM / np.sqrt(6)
+    touching = [each for each in found if each is not single]
+    places = [place for each in touching for place in (each.hollows_mm if len(each.hollows_mm) else [each.place_mm])]
+    assert len(places) == 2
+    assert all(min(pipe.distance_mm(pit, place) for place in places) < 2.5 for pit in pits)
