@@ -16,11 +16,9 @@ from matplotlib.figure import Figure
 from twin.design.figures_of_merit import find_line_ends
 from twin.design.sensor_arrays import extract_parameters
 from twin.design.study_tables import number_text
-from uwlts.model.calibration import CameraModel
 from uwlts.model.placement import laser_pose
 from uwlts.model.sensor import Camera, Medium, Sensor, Window
-from uwlts.optics.camera import directions
-from uwlts.optics.design import WindowGeometry, standoff_mm, trace_rays
+from uwlts.optics.design import WindowGeometry, standoff_mm, trace_pixels, trace_rays
 from uwlts.pages.toolkit import BLUE, INK, RED, SOFT, new_figure
 
 _BEYOND = 1.06  # length of drawn rays and sheet relative to the distance of the volume's far end
@@ -88,7 +86,7 @@ def make_view(sensor: Sensor, medium: Medium) -> SideView:
     sideways = math.hypot(*pose.normal[:2])
     across = pose.normal[:2] / sideways * (-1 if pose.normal[:2] @ pose.origin_mm[:2] < 0 else 1)
     side_axes = np.array([[*across, 0.0], ahead])
-    border = directions(CameraModel.from_description(camera), _find_border(camera, across))
+    border = trace_pixels(camera, _find_border(camera, across))
     return SideView(
         camera=_project(pupil, ahead, camera.window, windows[0], side_axes),
         laser=_project(pose.origin_mm, pose.axis, sensor.laser.window, windows[1], side_axes),

@@ -25,8 +25,10 @@ from typing import Any
 import numpy as np
 
 from uwlts.errors import DesignError
+from uwlts.model.calibration import CameraModel
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Camera, Medium, Sensor, Window
+from uwlts.optics.camera import directions
 
 Array = Any  # NumPy array, Dr.Jit array, or number
 Vector = tuple[Array, Array, Array]
@@ -240,6 +242,11 @@ class ImagePoints:
     path: Path
     slopes: tuple[Array, Array]
     jacobian: tuple[Array, Array, Array, Array]
+
+
+def trace_pixels(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """Return the rays (N, 3) in air of pixels (N, 2) of a described camera; NaN beyond the domain of its distortion."""
+    return directions(CameraModel.from_description(camera), pixels)
 
 
 def project_points(xp: ModuleType, lens: Lens, window: WindowGeometry, point: Vector) -> ImagePoints:

@@ -11,11 +11,9 @@ from tests.oracles import fermat
 from tests.virtual_sensors import altered
 from uwlts import cli
 from uwlts.errors import DesignError
-from uwlts.model.calibration import CameraModel
 from uwlts.model.placement import camera_from_object, laser_pose, view_of_sheet
 from uwlts.model.sensor import Sensor
 from uwlts.optics import design as g
-from uwlts.optics.camera import directions
 from uwlts.optics.nominal import design, format_table
 
 ANGLE = math.radians(35)
@@ -89,7 +87,7 @@ def test_the_lens_is_opencvs_and_undistorted(thesis_as_built):
     none = g.WindowGeometry((0.0, 0.0, 1.0), 0.0, 0.0, 1.0, 1.0)
     seen = g.project_points(np, lens, none, column(points))
     np.testing.assert_allclose(np.stack([seen.x, seen.y], axis=1), expected, atol=1e-9)
-    rays = directions(CameraModel.from_description(camera), expected)
+    rays = g.trace_pixels(camera, expected)
     np.testing.assert_allclose(rays / rays[:, 2:], points / points[:, 2:], atol=1e-6)
 
 
