@@ -12,11 +12,11 @@ from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_
 from scipy.special import ndtr, ndtri
 
 from twin.rendering_options import Effects, Flaws, Options
-from twin.scene.description import AnyMotion, PrintedPlate, Scene, Value, load_scene, value_at
+from twin.scene.description import AnyMotion, NamedSensor, PrintedPlate, Scene, Value, load_scene, value_at
 from uwlts.errors import DescriptionError
 from uwlts.files.reading import is_regular_file
-from uwlts.model.library import find_description, load_sensor, read_table, validate_description
-from uwlts.model.sensor import Description, Positive, Sensor
+from uwlts.model.library import find_description, read_table, validate_description
+from uwlts.model.sensor import Description, Positive
 
 FOLDER = "datasets"
 EXPOSURE = "frame.exposure"  # path that varies between frames; all others vary between scenes
@@ -186,8 +186,8 @@ class DataSetDescription(Description):
     title: str
     notes: str = ""
     licence: str = "not stated"
-    sensor: Sensor = Field(default="thesis", validate_default=True)
-    as_built: Sensor | None = None
+    sensor: NamedSensor = Field(default="thesis", validate_default=True)
+    as_built: NamedSensor | None = None
     motion: AnyMotion | None = None
     scene: Scene
     seed: Annotated[int, Field(ge=0)] = 0
@@ -201,11 +201,6 @@ class DataSetDescription(Description):
     labels: tuple[Label, ...] = ("centre", "quality", "masks", "sensor")
     vary: dict[str, AnyDistribution] = {}
     _whole: frozenset[str] = PrivateAttr(default=frozenset())
-
-    @field_validator("sensor", "as_built", mode="before")
-    @classmethod
-    def _load_sensor(cls, value: object) -> object:
-        return load_sensor(value) if isinstance(value, str) else value
 
     @field_validator("scene", mode="before")
     @classmethod

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from twin.design.figures_of_merit import FIGURES
 from twin.design.sensor_arrays import Follow
-from twin.scene.description import Value, value_at
+from twin.scene.description import NamedSensor, Value, value_at
 from uwlts.errors import DescriptionError
 from uwlts.files.reading import is_regular_file
-from uwlts.model.library import find_description, load_sensor, read_table, validate_description
+from uwlts.model.library import find_description, read_table, validate_description
 from uwlts.model.sensor import Description, Medium, NotNegative, Sensor
 
 FOLDER = "studies"
@@ -123,7 +123,7 @@ class Study(Description):
     """
 
     title: str
-    sensor: Sensor = Field(default="thesis", validate_default=True)
+    sensor: NamedSensor = Field(default="thesis", validate_default=True)
     medium: str = "water"
     reflectance: Annotated[float, Field(gt=0, le=1)] = 0.5
     water_depth_m: NotNegative = 100.0
@@ -134,11 +134,6 @@ class Study(Description):
     objectives: Annotated[tuple[Objective, ...], Field(min_length=1)] = (Objective(figure="sigma_z_rms_mm"),)
     constraints: dict[str, Constraint] = {}
     verify: Annotated[int, Field(ge=0, le=1000)] = 2
-
-    @field_validator("sensor", mode="before")
-    @classmethod
-    def _load_sensor(cls, value: object) -> object:
-        return load_sensor(value) if isinstance(value, str) else value
 
     @model_validator(mode="after")
     def _check_consistency(self) -> Study:

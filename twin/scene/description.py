@@ -18,7 +18,7 @@ from twin.scene.platform_kinds import Robot, RotaryTable, Vehicle
 from twin.scene.platforms import IdealPath, Motion, Platform
 from twin.scene.scene_object import FlatObject, Pose, Reflectance, SceneObject
 from uwlts.errors import DescriptionError
-from uwlts.model.library import find_description, read_table, validate_description
+from uwlts.model.library import find_description, load_sensor, read_table, validate_description
 from uwlts.model.sensor import Description, Medium, NotNegative, Positive, Sensor, Table, Vector
 from uwlts.targets import CircleTarget, Target, parse_target
 
@@ -316,6 +316,8 @@ def medium_of(sensor: Sensor, scene: Scene) -> Medium:
 
 
 Value = float | int | str | bool
+NamedSensor = Annotated[Sensor, BeforeValidator(lambda value: load_sensor(value) if isinstance(value, str) else value)]
+"""Sensor that a description may state by name or path."""
 
 
 def value_at(described: Description, path: str, source: str | Path, *, called: str = "sensor") -> Value | None:
