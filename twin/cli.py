@@ -9,7 +9,6 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 import twin
-from uwlts.errors import CommandFailed
 from uwlts.runtime.command_line import JOBS, Call, command_from, make_program, say, show
 from uwlts.runtime.console import run
 
@@ -60,6 +59,8 @@ def demo(call: Call) -> None:
 
 def _run_others(call: Call) -> Any:
     """Call a function that runs other commands; exit with the status of a failed one, which has printed its error."""
+    from twin.experiments.runner import CommandFailed
+
     try:
         return call()
     except CommandFailed as error:

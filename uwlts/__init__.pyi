@@ -30,4 +30,5 @@ from .storage.capture import Capture as Capture
 from .storage.cloud import PointCloud as PointCloud
 from .storage.export_ import export as export
 from .storage.import_.folder import import_images as import_images
+from .storage.import_.template import write_template as write_template
 from .stripe import StripeOptions as StripeOptions

@@ -91,14 +91,6 @@ class HardwareError(Error):
     """A camera, stage or laser does not answer, answers wrongly, or reports a fault."""
 
 
-class CommandFailed(Error):
-    """A command run by a function has failed and printed the reason; ``returncode`` is its exit code."""
-
-    def __init__(self, line: str, returncode: int):
-        super().__init__(f"{line} ended with exit code {returncode}")
-        self.returncode = returncode
-
-
 def list_problems(error: "ValidationError", most: int) -> "list[ErrorDetails]":
     """Return the first problems found by a validation; empty if there are too many to list them."""
     return error.errors(include_url=False)[:most] if error.error_count() <= _MOST_LISTED else []

@@ -24,6 +24,7 @@ from tests.system.test_camera_command import TARGET as BOARD
 from tests.system.test_documented_hardware import PAGES_RUN as HARDWARE_PAGES
 from tests.system.test_imported_calibration import CHESSBOARD, photographs, poses
 from tests.uwlts.mount_views import RADIUS_MM, SPHERE_MM, STANDOFF_MM, profile_of, sphere_campaign
+from tests.uwlts.storage.test_template import answered
 
 pytestmark = pytest.mark.slow
 
@@ -131,6 +132,32 @@ def photographs_on_a_robot(runner: Runner) -> None:
         at[-1][:3, :3], at[-1][:3, 3] = rotation.T, -rotation.T @ translation
     (folder / "target.toml").write_text(BOARD)
     write_poses(runner, np.array(at))
+
+
+def photographs_of_a_target(runner: Runner) -> None:
+    """The photographs of the page, and the robot's poses at them."""
+    (runner.folder / "target").mkdir()
+    for file in (ROOT / "tests" / "data" / "etna").glob("*.jpg"):
+        shutil.copy(file, runner.folder / "target")
+    header, *rows = (ROOT / "tests" / "data" / "etna" / "poses.csv").read_text().splitlines()[1:]
+    (runner.folder / "poses.csv").write_text("\n".join([header, *rows]))
+    timed = [f"{number},{row}" for number, row in enumerate(rows, start=1)]
+    (runner.folder / "track.csv").write_text("\n".join([f"time_s,{header}", *timed]))
+
+
+def answers(runner: Runner) -> None:
+    answered(runner.folder / "target" / "import.toml")
+
+
+def scan_of_a_robot(runner: Runner) -> None:
+    """The photographs once more, as a scan with numbers for times."""
+    folder = runner.folder / "scan"
+    shutil.copytree(runner.folder / "target", folder)
+    lines = (folder / "import.toml").read_text().partition("[target]")[0].splitlines()
+    kept = [line for line in lines if not line.startswith(("laser =", "lamp ="))]
+    (folder / "import.toml").write_text("\n".join(['table = "frames.csv"', *kept]))
+    frames = [f"frame{number:04}.jpg,laser,{number}" for number in range(1, 17)]
+    (folder / "frames.csv").write_text("\n".join(["file,light,time_s", *frames]))
 
 
 def trajectory_for_tum(runner: Runner) -> None:
@@ -256,6 +283,14 @@ PAGES_RUN = {
     "docs/how-to/scan-from-a-vehicle.md": Page(
         prepare={"uwlts reconstruct pass.h5 --calibration calibration.json --mount mount.json --traj": correct_nothing},
         not_run={"uwlts align pass.cloud.h5": ALIGNED_ELSEWHERE},
+    ),
+    "docs/how-to/your-photographs.md": Page(
+        prepare={
+            "uwlts template target": photographs_of_a_target,
+            "uwlts import target": answers,
+            "uwlts import scan": scan_of_a_robot,
+        },
+        figures="assert len(cloud) > 15000",
     ),
     "docs/reference/api.md": Page(given={name: name for name in ("target-air.h5", "target-water.h5", "spheres.h5")}),
     "docs/tutorials/calibrate-a-sensor.md": Page(

@@ -25,8 +25,9 @@ from uwlts.optics.design import (
     SheetGeometry,
     Vector,
     WindowGeometry,
+    add_vectors,
     dot,
-    place_laser,
+    scale_vector,
     select,
     standoff_mm,
     trace_to_points,
@@ -151,11 +152,16 @@ class SensorArrays:
         return np.broadcast_to(np.asarray(values, dtype=float).reshape(-1), (self.baseline_mm.size,)).copy()
 
     def pose(self, xp: ModuleType) -> LaserFan:
-        """Return the laser's fan in the camera frame."""
+        """Return the laser's fan in the camera frame, placed as by `uwlts.model.placement.laser_pose`."""
         towards = (1.0 - self.along_width, -self.along_width, 0.0 * self.along_width)
-        baseline, angle, roll = self.baseline_mm, self.angle_rad, self.roll_rad
-        by_angle = place_laser(xp, baseline_mm=baseline, angle_rad=angle, roll_rad=roll, towards=towards)
-        vectors = by_angle.origin, by_angle.axis, by_angle.fan, by_angle.normal
+        sine, cosine = xp.sin(self.angle_rad), xp.cos(self.angle_rad)
+        axis = (-sine * towards[0], -sine * towards[1], cosine)
+        across = (cosine * towards[0], cosine * towards[1], sine)
+        along = (-towards[1], towards[0], 0.0 * sine)
+        turn, keep = xp.sin(self.roll_rad), xp.cos(self.roll_rad)
+        fan = add_vectors(scale_vector(along, keep), scale_vector(across, -turn))
+        normal = add_vectors(scale_vector(across, keep), scale_vector(along, turn))
+        vectors = scale_vector(towards, self.baseline_mm), axis, fan, normal
         pairs = (zip(given, found, strict=True) for given, found in zip(self.placed, vectors, strict=True))
         return LaserFan(*(tuple(select(xp, xp.isfinite(one), one, other) for one, other in pair) for pair in pairs))
 

@@ -18,7 +18,7 @@ from typing import Literal
 from twin.scene.campaign import Take
 from twin.scene.description import Scene
 from twin.scene.forms import PittedPipe, Weld
-from uwlts.errors import CommandFailed, DescriptionError, SetupError
+from uwlts.errors import DescriptionError, Error, SetupError
 from uwlts.runtime.console import INTERRUPTED
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.runtime.workers import Lost, open_workers
@@ -31,6 +31,14 @@ COLOURED = "coloured.ply"  # end of the names of clouds with the colours of thei
 THESIS = "thesis"  # begin of the name of a file with figures of `uwlts thesis`
 
 Inspected = Literal["pipe", "weld"]  # kind of object for `uwlts inspect`
+
+
+class CommandFailed(Error):
+    """A command run by a function has failed and printed the reason; ``returncode`` is its exit code."""
+
+    def __init__(self, line: str, returncode: int):
+        super().__init__(f"{line} ended with exit code {returncode}")
+        self.returncode = returncode
 
 
 @dataclass(frozen=True)

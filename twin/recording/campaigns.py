@@ -14,7 +14,7 @@ from twin.rendering_options import CPU, Flaws, Options, Variant, use_variant
 from twin.scene.campaign import Campaign, Take, list_takes, load_campaign
 from twin.scene.description import Scene
 from uwlts.errors import CaptureError, DescriptionError, Error, OutputError, SetupError
-from uwlts.files.json_files import describe_other_plan, read_json
+from uwlts.files.json_files import describe_differences, read_json
 from uwlts.files.writing import write_file
 from uwlts.model.sensor import Sensor
 from uwlts.runtime.progress import ProgressListener, ignore_progress
@@ -230,7 +230,8 @@ def keep_to_plan(
         return
     how = f"that {PLAN} does not describe"
     if known is not None:
-        how = f"made with {describe_other_plan(known, plan)}"
+        other = ", ".join(key for key in plan if known.get(key) != plan[key])
+        how = f"made with another {other} ({describe_differences(known, plan)})"
     if found and not overwrite:
         raise DescriptionError(
             f"{folder} holds {called} {how}: give another folder, the same settings, or `overwrite` to start again"

@@ -24,9 +24,6 @@ from uwlts.targets import CircleTarget, Target, parse_target
 
 Kind = TypeVar("Kind", bound=Description)
 
-NamedSensor = Annotated[Sensor, BeforeValidator(lambda given: load_sensor(given) if isinstance(given, str) else given)]
-"""Sensor of a description, which may also give its name or path."""
-
 
 def replace_values(described: Kind, **changes: object) -> Kind:
     """Return a copy with replaced values, unvalidated; a table of changes applies to the nested description."""
@@ -316,6 +313,8 @@ def medium_of(sensor: Sensor, scene: Scene) -> Medium:
 
 
 Value = float | int | str | bool
+NamedSensor = Annotated[Sensor, BeforeValidator(lambda value: load_sensor(value) if isinstance(value, str) else value)]
+"""Sensor that a description may state by name or path."""
 
 
 def value_at(described: Description, path: str, source: str | Path, *, called: str = "sensor") -> Value | None:

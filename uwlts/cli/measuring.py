@@ -218,7 +218,7 @@ def inspect(
     overwrite: Overwrite = False,
 ) -> None:
     """Example: uwlts inspect pipe.cloud.h5 --wall-mm 9.5 --out pipe.json"""
-    from uwlts.inspection.inspect import inspect_cloud
+    from uwlts.report.findings_page import inspect_cloud
     from uwlts.report.plot import surface_limit_mm
     from uwlts.storage.cloud_files import load_cloud
 

@@ -73,6 +73,12 @@ def import_(call: Call) -> None:
     say(f"wrote {call.given['out']} with {imported.laser} laser and {imported.lamp} lamp images")
 
 
+@command_from(app, uwlts, "write_template", job="Files")
+def template(call: Call) -> None:
+    """Example: uwlts template photographs"""
+    say(f'wrote {call()}: replace each "?" in it, then run uwlts import')
+
+
 @command_from(app, uwlts, "export", job="Files")
 def export(call: Call) -> None:
     """Example: uwlts export scan.cloud.h5 --out scan.laz"""

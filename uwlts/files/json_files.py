@@ -136,11 +136,6 @@ def describe_differences(there: object, now: object) -> str:
     return "; ".join(found[:_SHOWN] + more)
 
 
-def describe_other_plan(there: dict[str, JsonValue], now: dict[str, JsonValue]) -> str:
-    """Describe how a file's plan differs from the wanted one: the different keys, and `describe_differences`."""
-    return f"another {', '.join(key for key in now if there.get(key) != now[key])} ({describe_differences(there, now)})"
-
-
 def _compare(there: object, now: object, entry: str) -> Iterator[tuple[str, object, object]]:
     if isinstance(there, dict) and isinstance(now, dict):
         for key in dict.fromkeys((*now, *there)):

@@ -8,7 +8,7 @@ import hashlib
 import os
 import secrets
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from uwlts.argument_types import refuse_input
@@ -50,7 +50,9 @@ def write_atomically(path: str | os.PathLike[str], *, overwrite: bool = False) -
             if os.name == "posix":
                 _flush(target.parent, os.O_RDONLY)
     finally:
-        aside.unlink(missing_ok=True)
+        # A read-only file system refuses this too, which must not replace its first error.
+        with suppress(OSError):
+            aside.unlink(missing_ok=True)
         _incomplete.discard(aside)
 
 
@@ -83,6 +85,8 @@ def refuse_unsuitable(target: Path, *, overwrite: bool, endings: Sequence[str] =
     require_possible_name(target)
     if not target.parent.is_dir():
         raise OutputError(f"cannot write {target}: the folder {target.parent} does not exist; create it first")
+    if not os.access(target.parent, os.W_OK):
+        raise OutputError(f"cannot write {target}: {target.parent.absolute()} is read-only, or permission is missing")
     if target.exists() and not target.is_file():
         raise OutputError(f"cannot write {target}: it exists and is not a regular file; choose another name")
     refuse_input(target)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from ipaddress import ip_address
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from uwlts.runtime.optional_library import load_aravis
 
 BUFFER_COMPLETE = 0  # ARV_BUFFER_STATUS_SUCCESS
 _ENCODER = "EncoderValue"  # requested chunk data; the name of its feature is prefixed with ``Chunk``
-_PLAIN: dict[str, bool | int | float] = dict.fromkeys(["ReverseX", "ReverseY", "LUTEnable", "GammaEnable"], False)
+_PLAIN: dict[str, float] = dict.fromkeys(["ReverseX", "ReverseY", "LUTEnable", "GammaEnable"], False)
 _PLAIN |= dict.fromkeys(["BinningHorizontal", "BinningVertical", "DecimationHorizontal", "DecimationVertical"], 1)
 _PLAIN |= {"Gamma": 1.0}
 """Features (GenICam SFNC 2.7) and their values for images as on the image sensor, with grey values linear in light."""
@@ -88,7 +88,7 @@ _OTHERS: tuple[tuple[Any, str, list[Any]], ...] = (
 )
 
 
-_KINDS: dict[type, str] = {float: "float", bool: "boolean", int: "integer"}
+_KINDS = ("float", "boolean", "integer")  # integers last: choices from a list have numbers, too
 
 
 def _load_functions() -> SimpleNamespace:
@@ -190,28 +190,37 @@ class AravisCamera(CameraDevice):
                 for part in ("vendor_name", "model_name", "device_serial_number")
             )
             bits = _MONO_BITS.get(self._read_pixel_format(), 8)
-            black = self._read_feature("BlackLevel", float)
+            black = self._access("get", "BlackLevel")
         except BaseException:
             self._close()
             raise
         return CameraInfo(f"{maker} {model}", serial, width, height, bits, black)
 
-    def _read_feature(self, name: str, kind: type[float] | type[int]) -> Any:
-        """Return the value of a camera feature, or None if the camera does not have it."""
-        return self._call(f"get_{_KINDS[kind]}", name.encode()) if self._offers(name) else None
+    def _access(self, verb: Literal["get", "set"], name: str, *value: float) -> Any:
+        """Read or set a feature, whose type depends on the camera's maker; None if the camera does not have it."""
+        for kind in _KINDS if self._offers(name) else ():
+            try:
+                return self._call(f"{verb}_{kind}", name.encode(), *value)
+            except HardwareError:
+                if self._gone or kind == _KINDS[-1]:
+                    raise
+        return None
 
     def _set_plain(self) -> None:
         """Switch off what mirrors, bins or bends the images; a calibration is for images without it."""
-        found = {name: self._read_feature(name, type(plain)) for name, plain in _PLAIN.items()}
+        found = {name: self._access("get", name) for name in _PLAIN}
         if found["GammaEnable"] is not None:
             # Then Gamma has no effect, and is often locked.
             found["Gamma"] = None
-        changed = {name: value for name, value in found.items() if value not in (None, _PLAIN[name])}
+        elif isinstance(found["Gamma"], int):
+            log_warnings(self.address, [f"Gamma is choice {found.pop('Gamma')}: check that images are linear in light"])
+        # Binning by 0 is a choice from a list, too.
+        changed = {name: value for name, value in found.items() if value not in (None, 0, _PLAIN[name])}
         for name, value in changed.items():
             plain = _PLAIN[name]
             with suppress(HardwareError):
-                self._call(f"set_{_KINDS[type(plain)]}", name.encode(), plain)
-            if self._read_feature(name, type(plain)) != plain:
+                self._access("set", name, plain)
+            if self._access("get", name) != plain:
                 raise HardwareError(
                     f"the camera {self.address} has {name} = {value:g}, and does not accept {plain:g}: change it in "
                     "the camera's own program; images must be as on the image sensor, and linear in light"
@@ -305,12 +314,12 @@ class AravisCamera(CameraDevice):
             self._call("set_chunk_state", _ENCODER.encode(), 1)
 
     def _set_number(self, feature: str, value: float | None, *, automatic: str | None = None) -> None:
+        if automatic and self._call(f"is_{automatic}_auto_available"):
+            self._call(f"set_{feature}_auto", 0)
         if value is None:
             return
         if not self._has(feature):
             raise HardwareError(f"the camera {self.address} has no setting for {feature.replace('_', ' ')}")
-        if automatic and self._call(f"is_{automatic}_auto_available"):
-            self._call(f"set_{feature}_auto", 0)
         low, high = c_double(), c_double()
         self._call(f"get_{feature}_bounds", byref(low), byref(high))
         # Some cameras reject values out of range, others stop answering.

@@ -74,24 +74,6 @@ class LaserFan:
     normal: Vector
 
 
-def place_laser(xp: ModuleType, *, baseline_mm: Array, angle_rad: Array, roll_rad: Array, towards: Vector) -> LaserFan:
-    """Return the fan of a laser that is placed by baseline and triangulation angle.
-
-    The result is that of `uwlts.model.placement.laser_pose`, but differentiable.
-
-    ``xp`` is NumPy or Dr.Jit, ``towards`` the direction (x, y, 0) of the baseline, and ``roll_rad`` the rotation of the
-    fan about the laser's axis.
-    """
-    sine, cosine = xp.sin(angle_rad), xp.cos(angle_rad)
-    axis = (-sine * towards[0], -sine * towards[1], cosine)
-    across = (cosine * towards[0], cosine * towards[1], sine)
-    along = (-towards[1], towards[0], 0.0 * sine)
-    turn, keep = xp.sin(roll_rad), xp.cos(roll_rad)
-    normal = add_vectors(scale_vector(across, keep), scale_vector(along, turn))
-    fan = add_vectors(scale_vector(along, keep), scale_vector(across, -turn))
-    return LaserFan(scale_vector(towards, baseline_mm), axis, fan, normal)
-
-
 def standoff_mm(pose: LaserFan) -> Array:
     """Return the depth of the sheet on the camera's axis, from the entrance pupil."""
     return dot(pose.normal, pose.origin) / pose.normal[2]

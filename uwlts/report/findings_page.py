@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.colors import ListedColormap
@@ -37,8 +38,9 @@ from uwlts.inspection.findings_order import (
     resolve_datum,
     sort_by_severity,
 )
-from uwlts.inspection.inspect import InspectionKind, inspect_cloud
 from uwlts.inspection.picking import COLUMNS, MEASURED_ENDINGS, MeasuredValues, read_measured
+from uwlts.inspection.pipe import inspect_pipe
+from uwlts.inspection.weld import inspect_weld
 from uwlts.model.calibration import calibration_digest
 from uwlts.model.sensor import Table
 from uwlts.pages.toolkit import (
@@ -73,6 +75,8 @@ _SEEN = "#b9c0c8", "#d9822b", "#8fb8a0"
 """Colours of cells without points, with points that were not inspected, and with inspected ones."""
 _CELL_POINTS, _MOST_CELLS = 4, 160
 """Mean number of points in a cell of the map of what was seen, and most cells along a side."""
+InspectionKind = Literal["pipe", "weld"]
+_INSPECTIONS: dict[InspectionKind, Callable[..., Inspection]] = {"pipe": inspect_pipe, "weld": inspect_weld}
 _AROUND = 1.2  # size of the area shown around a finding, relative to the finding
 
 
@@ -201,6 +205,14 @@ def write_findings(
     }
     write_page(page, text, beside=json_text(record, indent=1), kind=FINDINGS, pdf=pdf, overwrite=overwrite)
     return found
+
+
+def inspect_cloud(cloud: PointCloud | str | os.PathLike[str], kind: InspectionKind, **options: object) -> Inspection:
+    """Inspect a cloud as a kind of object; EvaluationError for an option that this kind does not have."""
+    function = _INSPECTIONS[kind]
+    if foreign := [f"`{name}`" for name in options if name not in inspect.signature(function).parameters]:
+        raise EvaluationError(f"the inspection of a {kind} does not take {', '.join(foreign)}: remove the option")
+    return function(cloud, **options)
 
 
 def write_measured(page: str | Path, measured: MeasuredValues, *, title: str, overwrite: bool = False) -> list[Path]:

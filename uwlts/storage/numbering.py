@@ -11,7 +11,9 @@ from numpy.typing import ArrayLike
 
 from uwlts.errors import DescriptionError
 
-_LONGEST = 18  # digits of a number of 64 bits
+_LARGEST = 2**63 - 1  # number of 64 bits
+_UNIX_TIME = re.compile(r"(?<![0-9])(1[0-9]{9})[._]?((?:[0-9]{3}){0,3})(?![0-9])")
+"""Seconds since 1970, and what is behind their decimal point, which may be left out."""
 _OF_CLOCK = 6  # fewest digits of a time of day (HHMMSS)
 _REGULAR = 0.2  # largest relative deviation of regular time steps, and largest fraction of steps that exceed it
 _FEWEST_STEPS = 5
@@ -35,8 +37,9 @@ class Counted(NamedTuple):
 def count_names(names: Sequence[str], *, series: bool = False) -> Counted | None:
     """Return the increasing numbers of images in their names.
 
-    The names differ in one number, or in several; then the one with the fewest gaps counts. None if no number counts,
-    as in names without digits and in times. ``series``: numbers may start again, as for poses in a list of their own.
+    The names differ in one number, or in several; then the one with the fewest gaps counts, or one with a decimal point
+    and less gaps than images. None if no number counts, as in names without digits and in times. ``series``: numbers
+    may start again, as for poses in a list of their own.
 
     Raises DescriptionError for a mixture of naming, a number that occurs twice, and numbers that decrease or restart.
     """
@@ -52,7 +55,13 @@ def count_names(names: Sequence[str], *, series: bool = False) -> Counted | None
         )
     columns = [[int(number) for number in column] for column in zip(*(part[1::2] for part in parts), strict=True)]
     varying = [column for column in columns if len(set(column)) > 1]
-    counts = [_count(np.array(column)) for column in varying if max(column) < 10**_LONGEST]
+    counts = [_count(np.array(column)) for column in varying if max(column) <= _LARGEST]
+    decimal = [
+        _count(np.array([int(part[at] + part[at + 2]) for part in parts]))
+        for at in range(1, len(parts[0]) - 2, 2)
+        if parts[0][at + 1] == "." and len({len(part[at + 2]) for part in parts}) == 1
+    ]
+    counts += [each for each in decimal if each is not None and each.places()[-1] < 2 * len(names)]
     if known := [each for each in counts if each is not None]:
         return min(known, key=lambda each: each.places()[-1])
     alone = len(varying) < 2
@@ -104,7 +113,13 @@ def name_gaps(names: Sequence[str], counted: Counted | None) -> list[str]:
 
 
 def time_gaps(names: Sequence[str], times_s: np.ndarray) -> list[str]:
-    """Return a warning about a gap in the times (N,) of images that are otherwise regular, if there is any."""
+    """Return a warning about a gap in the times (N,) of images that are otherwise regular, if there is any.
+
+    Times that are NaN are those since 1970 in the names, if there are any.
+    """
+    found = [_UNIX_TIME.search(PurePosixPath(name).name) for name in names]
+    named_s = [float(f"{each[1]}.{each[2]}") if each else np.nan for each in found]
+    times_s = np.where(np.isnan(times_s), named_s, times_s)
     steps = np.diff(times_s)
     if len(steps) < _FEWEST_STEPS or not np.isfinite(steps).all() or not steps.min() > 0:
         return []

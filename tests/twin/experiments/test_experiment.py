@@ -15,8 +15,8 @@ import twin
 import uwlts
 from twin.experiments.detection import ProbabilityOfDetection
 from twin.experiments.result import ExperimentResult
-from twin.experiments.runner import CommandLine, run_stages
-from uwlts.errors import CommandFailed, DescriptionError, DescriptionWarning, SetupError
+from twin.experiments.runner import CommandFailed, CommandLine, run_stages
+from uwlts.errors import DescriptionError, DescriptionWarning, SetupError
 from uwlts.model.library import load_sensor
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import write_cloud

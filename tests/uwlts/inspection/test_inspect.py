@@ -20,9 +20,9 @@ from uwlts.errors import EvaluationError
 from uwlts.inspection.bell_maps import UnrolledSurface
 from uwlts.inspection.blemish_search import search_blemishes
 from uwlts.inspection.features import DEFINITIONS, FeatureKind
-from uwlts.inspection.inspect import inspect_cloud
 from uwlts.inspection.pipe_form import PipeFormRule, fit_pipe, pipe_features
 from uwlts.inspection.weld import _find_toes
+from uwlts.report.findings_page import inspect_cloud
 from uwlts.shapes.flat import Circle
 from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PAIRS, PointCloud, PointUncertainty, make_foreign_cloud
 

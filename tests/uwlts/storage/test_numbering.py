@@ -1,12 +1,13 @@
 """Numbers in names count one scan; encoder counts continue where the counter passes the end of its range."""
 
+import re
 from datetime import datetime, timedelta
 
 import numpy as np
 import pytest
 
 from uwlts.errors import DescriptionError
-from uwlts.storage.numbering import count_names, unwrap_counts
+from uwlts.storage.numbering import count_names, time_gaps, unwrap_counts
 
 
 @pytest.mark.parametrize("form", ["scan{}_{:03d}.png", "{}/laser_{}.png", "2024-05-0{}_{:04d}.tif"])
@@ -28,6 +29,34 @@ def test_times_in_names_are_no_counts_that_start_again(form: str, step_s: float)
     begin = datetime(2024, 5, 1, 10, 58, 0, 123456)
     times = [(begin + timedelta(seconds=step_s * number)).strftime(form) for number in range(400)]
     count_names(list(dict.fromkeys(times)))
+
+
+@pytest.mark.parametrize(
+    ("form", "numbers", "last"),
+    [
+        ("frame{:04d}.png", np.arange(12), 11),
+        ("{}_laser_exp5.png", 5 * np.arange(12), 11),
+        # Positions with a decimal point, also from 0, and nanoseconds.
+        ("laser_{:.2f}mm.png", 0.25 * np.arange(3, 15), 11),
+        ("laser_{:.1f}mm.png", 0.5 * np.arange(12), 11),
+        ("{}.png", 1_717_243_200_000_000_005 + 250_000_007 * np.arange(12), 11),
+    ],
+)
+def test_numbers_in_names_show_an_image_that_is_missing(form, numbers, last):
+    counted = count_names([form.format(number) for number in np.delete(numbers, 6)])
+    assert counted is not None and counted.places().tolist() == [*range(6), *range(7, last + 1)]
+
+
+@pytest.mark.parametrize(("form", "unit_s"), [("{:.6f}.png", 1.0), ("{:.0f}.png", 1e-3), ("a/cam0_{:.0f}.png", 1e-9)])
+def test_times_in_names_show_an_image_that_is_missing(form, unit_s):
+    rng = np.random.default_rng(3)
+    times_s = 1_717_243_200 + 0.25 * np.arange(12) + rng.uniform(0, 0.005, 12)
+    names = [form.format(time_s / unit_s) for time_s in times_s]
+    assert time_gaps(names, np.full(12, np.nan)) == []
+    lost = names[:6] + names[7:]
+    assert count_names(lost) is None
+    (said,) = time_gaps(lost, np.full(11, np.nan))
+    assert re.match(r"the times jump by 0\.(5|49)\d* s after image 6, .* usually by 0\.2", said)
 
 
 def wrapped(counts: np.ndarray, bits: int, *, signed: bool) -> np.ndarray:

@@ -7,7 +7,7 @@ from uwlts.targets.detection.chessboard_grid import (
     measure_corners,
     refine_corners,
 )
-from uwlts.targets.detection.chessboard_lattice import find_board
+from uwlts.targets.detection.chessboard_lattice import find_board, find_largest_piece
 from uwlts.targets.detection.ellipses import Ellipses, find_circles, measure_marks
 from uwlts.targets.detection.lattice import Lattice, detect_lattice, label_lattice
 
@@ -20,6 +20,7 @@ __all__ = [
     "find_board",
     "find_chessboard_fault",
     "find_circles",
+    "find_largest_piece",
     "label_lattice",
     "measure_corners",
     "measure_marks",

@@ -1,5 +1,6 @@
 """Corners of a chessboard seen completely or in part: a lattice grown over saddle points of the grey levels."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
@@ -126,23 +127,33 @@ def find_board(grey: np.ndarray, columns: int, rows: int) -> np.ndarray | None:
         if min(small.shape) < 8 * _Rule.ring_px:
             break
         corners = _Corners.from_image(small)
-        if len(corners.pixels) < 4:
-            continue
-        tree, tried, found = KDTree(corners.pixels), set(), {}
-        for number, (seed, steps) in enumerate(corners.find_seeds(tree)):
-            if number >= _Rule.most_seeds or len(found) >= columns * rows:
-                break
-            if seed not in tried:
-                same = corners.may_be_neighbours
-                piece = grow_lattice(seed, steps, corners.pixels, tree, nearest=4, may_be_neighbours=same)
-                tried.update(piece.values())
-                found = max(found, piece, key=len)
-        board = _complete_board(_arrange_piece(found, corners), columns, rows, corners.grey)
+        board = _complete_board(_find_piece(corners, columns * rows), columns, rows, corners.grey)
         if board is not None and (best is None or count_corners(board) > count_corners(best)):
             best = (board + 0.5) / scale - 0.5
         if best is not None and count_corners(best) == columns * rows:
             break
     return best
+
+
+def find_largest_piece(grey: np.ndarray) -> np.ndarray:
+    """Return corners (J, I, 2) of the largest piece of any board in a grey image (H, W), NaN where they are missing."""
+    return _find_piece(_Corners.from_image(grey), math.inf)
+
+
+def _find_piece(corners: _Corners, most: float) -> np.ndarray:
+    """Return the largest piece (J, I, 2) that grows from the seeds, or the first one of ``most`` corners."""
+    if len(corners.pixels) < 4:
+        return np.empty((0, 0, 2))
+    tree, tried, found = KDTree(corners.pixels), set(), {}
+    for number, (seed, steps) in enumerate(corners.find_seeds(tree)):
+        if number >= _Rule.most_seeds or len(found) >= most:
+            break
+        if seed not in tried:
+            same = corners.may_be_neighbours
+            piece = grow_lattice(seed, steps, corners.pixels, tree, nearest=4, may_be_neighbours=same)
+            tried.update(piece.values())
+            found = max(found, piece, key=len)
+    return _arrange_piece(found, corners)
 
 
 def _arrange_piece(places: dict[tuple[int, int], int], corners: _Corners) -> np.ndarray:
