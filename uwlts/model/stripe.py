@@ -7,8 +7,6 @@ from enum import IntEnum
 
 import numpy as np
 
-from uwlts.errors import RangeError
-
 
 class StripeStatus(IntEnum):
     """Result of stripe detection on a profile line; only OK has a centre."""
@@ -107,25 +105,6 @@ class StripeCandidates:
         columns = self.line, self.centre_px, self.amplitude, self.width_px, self.log_likelihood
         kept = (column[some] for column in columns)
         return StripeCandidates(*kept, count=self.count, stripe_along=self.stripe_along)
-
-    def split(self, sheets: int = 2) -> list[Stripe]:
-        """Return one `Stripe` for each light sheet, sorted by increasing centre.
-
-        The status of a line is AMBIGUOUS if the number of its candidates differs from the number of sheets, and
-        NO_STRIPE if there is no candidate. Raises RangeError for a number of sheets below 1.
-        """
-        if sheets < 1:
-            raise RangeError(f"sheets is {sheets}; expected 1 or more")
-        on_line = np.bincount(self.line, minlength=self.count)
-        status = np.full(self.count, StripeStatus.AMBIGUOUS, np.uint8)
-        status[on_line == 0], status[on_line == sheets] = StripeStatus.NO_STRIPE, StripeStatus.OK
-        lines = np.flatnonzero(on_line == sheets)
-        found = []
-        for number in range(sheets):
-            chosen = self[np.searchsorted(self.line, lines) + number]
-            columns = chosen.centre_px, chosen.amplitude, chosen.width_px
-            found.append(Stripe.from_lines(lines, *columns, status=status.copy(), stripe_along=self.stripe_along))
-        return found
 
     def pixels(self) -> np.ndarray:
         """Return the image coordinates (M, 2), u = column and v = row in px."""

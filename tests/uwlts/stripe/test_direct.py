@@ -6,9 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from uwlts.errors import RangeError
 from uwlts.model.library import load_sensor
-from uwlts.stripe import StripeOptions, StripeStatus, extract_candidates, extract_stripe, find_stripes
+from uwlts.stripe import StripeOptions, extract_candidates, extract_stripe, find_stripes
 
 LINES, LENGTH = 400, 320
 BRIGHTEST = StripeOptions(peak="strongest", ambiguous_ratio=1.0)
@@ -139,19 +138,16 @@ def test_a_block_whose_edges_show_the_floor_beside_it_stays():
     assert np.count_nonzero(np.isin(stripes.line, np.arange(151, 259))) > 100
 
 
-def test_two_sheets_are_split_in_their_order():
+def test_all_stripes_of_two_sheets_are_candidates_in_their_order():
     near, far = 100 + 0.1 * X, 180 + 0.05 * X
     candidates = extract_candidates(drawn((near, 60), (on(0, 300, far), 140)), stripe_along="width", saturation=255)
-    first, second = candidates.split(2)
-    assert np.mean(first.status[:300] == StripeStatus.OK) > 0.99
-    assert (first.status[300:] == StripeStatus.AMBIGUOUS).all()
+    assert (np.diff(candidates.line) >= 0).all()
+    both = np.isin(candidates.line, np.flatnonzero(np.bincount(candidates.line, minlength=LINES) == 2))
+    first, second = candidates[both][::2], candidates[both][1::2]
+    assert np.isin(np.arange(300), first.line).mean() > 0.99 and first.line.max() < 300
     for stripe, place in ((first, near), (second, far)):
         # Noise of one level on 60: Cramer-Rao bound 0.02 px; more than five times that.
-        assert np.nanmax(np.abs(stripe.centre_px[:300] - place[:300])) < 0.12
-    assert np.isnan(second.centre_px[300:]).all()
-    assert (np.diff(candidates.line) >= 0).all()
+        assert np.abs(stripe.centre_px - place[stripe.line]).max() < 0.12
     # The likelihoods differ by the ratio of the squared heights.
     likelihood = candidates.log_likelihood[candidates.line == 150]
     assert likelihood[1] / likelihood[0] == pytest.approx((140 / 60) ** 2, rel=0.3)
-    with pytest.raises(RangeError, match="sheets is 0"):
-        candidates.split(0)
