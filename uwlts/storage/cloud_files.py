@@ -467,7 +467,8 @@ def _read_ply(path: Path, rows: _Rows, unit: Unit | None) -> tuple[PointCloud, i
         time_s=column("time", np.nan, np.float64) if "time" in known else None,
         metadata=metadata,
         warnings=[*doubts, *warnings],
-        **{f"{name}_mm": column(name, np.nan) for name in lean},
+        random_std_mm=column("random_std", np.nan) if "random_std" in lean else None,
+        common_std_mm=column("common_std", np.nan) if "common_std" in lean else None,
     )
     return note_step(cloud, scale * find_float_step(points)), len(whole)
 

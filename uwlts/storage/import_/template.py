@@ -36,7 +36,7 @@ _FEWEST_POINTS = 12  # of a target: images of tests/data/ciclop without a board 
 
 class _Line(NamedTuple):
     along: str
-    count: int
+    profile_lines: int
     place_px: float
 
 
@@ -71,7 +71,7 @@ class _Group:
             for channel in _CHANNELS if self.colour else (None,):
                 grey = [extract_channel(each, channel, name="").clip(0).astype(each.dtype) for each in images]
                 lines = [line for each in grey if (line := _find_line(each, brightest))]
-                if sum(line.count for line in lines) > sum(line.count for line in self.lines):
+                if sum(line.profile_lines for line in lines) > sum(line.profile_lines for line in self.lines):
                     self.lines, self.channel, self.background = lines, channel, dark
             if self.lines:
                 break
@@ -132,7 +132,7 @@ def _find_line(image: np.ndarray, brightest: float) -> _Line | None:
         enough = len(centres) > _LINES * size and np.median(heights) > _HEIGHT * brightest
         if enough and np.mean(np.abs(np.diff(centres)) < 3) > _SMOOTH:
             found.append(_Line(along, len(centres), float(np.median(centres))))
-    return max(found, key=lambda line: line.count, default=None)
+    return max(found, key=lambda line: line.profile_lines, default=None)
 
 
 def _find_board(image: np.ndarray) -> _Board | None:
