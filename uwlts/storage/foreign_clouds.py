@@ -141,7 +141,8 @@ def _read_e57(path: Path, unit: Unit | None = None) -> PointCloud:
         raise CaptureError(f"{path} is not a complete E57 file: {shorten_error(error)}") from error
     if not scans:
         raise CaptureError(f"{path} is an E57 file without scans")
-    if unit is None and (stated := describe_units(system)).metres != (1.0, 1.0, 1.0):
+    stated = describe_units(system)
+    if unit is None and stated.metres != (1.0, 1.0, 1.0):
         raise CaptureError(
             f"{path} states a coordinate system in {stated.name}, but E57 prescribes m: give the unit m if it is right"
         )
@@ -158,6 +159,7 @@ def _read_e57(path: Path, unit: Unit | None = None) -> PointCloud:
     )
     if total > len(points):
         cloud.warnings.insert(0, f"{total - len(points)} of {total} points marked as invalid are omitted")
+    cloud.warnings.extend(stated.notes if unit is None else ())
     return cloud
 
 

@@ -137,15 +137,28 @@ def test_comments_of_ply_obj_and_stl_state_a_unit(tmp_path: Path, caplog: pytest
         assert load_triangles(tmp_path / name).area == pytest.approx(6 * 25.4**2)
 
 
-def test_e57_in_feet_is_asked_about(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    # The library writes an empty coordinate system.
+def write_e57(path: Path, system: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write points with a coordinate system; the library writes an empty one."""
     plain = pye57.libe57.StringNode
     with monkeypatch.context() as patch:
-        patch.setattr(pye57.libe57, "StringNode", lambda image, text="": plain(image, text or PLANE))
-        write_cloud(tmp_path / "b.e57", make_foreign_cloud(POINTS_MM))
+        patch.setattr(pye57.libe57, "StringNode", lambda image, text="": plain(image, text or system))
+        write_cloud(path, make_foreign_cloud(POINTS_MM))
+
+
+def test_e57_in_feet_is_asked_about(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    write_e57(tmp_path / "b.e57", PLANE, monkeypatch)
     with pytest.raises(uwlts.Error, match="in US survey foot, but E57 prescribes m"):
         uwlts.read(tmp_path / "b.e57")
     assert np.abs(uwlts.read(tmp_path / "b.e57", unit="m").points_mm - POINTS_MM).max() < 1e-3
+
+
+@pytest.mark.parametrize(("system", "warned"), [("EPSG:2225", True), ("units: feet", True), ("", False)])
+def test_e57_in_a_system_of_unknown_unit_is_warned_of(tmp_path: Path, monkeypatch, system: str, warned: bool):
+    write_e57(tmp_path / "a.e57", system, monkeypatch)
+    assert (
+        any("states no unit of length: read in m" in text for text in uwlts.read(tmp_path / "a.e57").warnings) == warned
+    )
+    assert not uwlts.read(tmp_path / "a.e57", unit="m").warnings
 
 
 def test_glb_is_in_metres(tmp_path: Path):
