@@ -10,11 +10,11 @@ from uwlts.desk.instrument import Instrument
 from uwlts.desk.shown_state import Board
 
 
-def guide_calibration(plan: Path, out: Path) -> None:
+def guide_calibration(plan: str, out: str) -> None:
     """Carry out a plan, and print the log while it grows."""
     board, done, printed = Board("guided"), threading.Event(), -1
     with closing(Instrument(board)) as device:
-        device.ask(device.calibrate, load_guided_plan(plan), out, resume=False, overwrite=False)
+        device.ask(device.calibrate, load_guided_plan(Path(plan)), Path(out), resume=False, overwrite=False)
         device.ask(done.set)
         threading.Thread(target=lambda: [device.answer(line.strip()) for line in sys.stdin], daemon=True).start()
         ended = False
@@ -23,7 +23,3 @@ def guide_calibration(plan: Path, out: Path) -> None:
             for line in board.lines(printed):
                 print(line.text, flush=True)
                 printed = line.number
-
-
-if __name__ == "__main__":
-    guide_calibration(Path(sys.argv[1]), Path(sys.argv[2]))

@@ -244,7 +244,7 @@ def test_the_thesiss_sensor_measures_a_plane_in_water(thesis, tmp_path):
     calibration = json.loads((tmp_path / "calibration.json").read_text(encoding="utf-8"))
     residuals = calibration["residuals"]
     assert residuals["window"]["distance_mm"] == pytest.approx(thesis.camera.window.distance_mm, abs=0.5)
-    assert calibration["camera"]["fx_px"] == pytest.approx(thesis.camera.focal_length_px(), rel=1e-3)
+    assert calibration["camera"]["fx_px"] == pytest.approx(halved.camera.focal_length_px(), rel=1e-3)
     assert residuals["camera"]["images"] == TARGET_POSES and calibration["provenance"]["warnings"] == []
     assert 0 < found.exposure_ms < thesis.exposure.longest_ms
     assert found.seconds > 0
