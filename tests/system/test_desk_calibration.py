@@ -341,7 +341,7 @@ def test_a_target_held_by_hand_is_led_to_a_calibration(served, folder, tmp_path)
                 encoding="utf-8",
             )
             # The images are drawn in this process: the guide has one of its own, as the desk's program has.
-            code = "import sys; from tests.system.guided_process import guide_calibration; guide_calibration(*sys.argv[1:])"
+            code = "import sys; from tests.system import guided_process as it; it.guide_calibration(*sys.argv[1:])"
             guide = [sys.executable, "-c", code, str(plan), str(tmp_path / "c.json")]
             said: list[str] = []
             with subprocess.Popen(guide, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as going:
