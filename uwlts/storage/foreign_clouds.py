@@ -131,9 +131,8 @@ def _read_e57(path: Path, unit: Unit | None = None) -> PointCloud:
     require_regular_file(path, called="cloud")
     try:
         with pye57.E57(str(path)) as file:
-            numbers = range(file.scan_count)
-            scans = [file.read_scan(number, intensity=True, ignore_missing_fields=True) for number in numbers]
-            headers = [file.get_header(number) for number in numbers]
+            headers = [file.get_header(number) for number in range(file.scan_count)]
+            scans = [file.read_scan(k, intensity=True, ignore_missing_fields=True) for k in range(len(headers))]
             system = file.root["coordinateMetadata"].value() if file.root.isDefined("coordinateMetadata") else ""
             total = sum(header.point_count for header in headers)
             origins = [header.translation if header.has_pose() else np.zeros(3) for header in headers]
@@ -141,8 +140,8 @@ def _read_e57(path: Path, unit: Unit | None = None) -> PointCloud:
         raise CaptureError(f"{path} is not a complete E57 file: {shorten_error(error)}") from error
     if not scans:
         raise CaptureError(f"{path} is an E57 file without scans")
-    stated = describe_units(system)
-    if unit is None and stated.metres != (1.0, 1.0, 1.0):
+    stated = describe_units(system if unit is None else "")
+    if stated.metres != (1.0, 1.0, 1.0):
         raise CaptureError(
             f"{path} states a coordinate system in {stated.name}, but E57 prescribes m: give the unit m if it is right"
         )
@@ -159,7 +158,7 @@ def _read_e57(path: Path, unit: Unit | None = None) -> PointCloud:
     )
     if total > len(points):
         cloud.warnings.insert(0, f"{total - len(points)} of {total} points marked as invalid are omitted")
-    cloud.warnings.extend(stated.notes if unit is None else ())
+    cloud.warnings.extend(stated.notes)
     return cloud
 
 
