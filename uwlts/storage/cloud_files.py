@@ -448,7 +448,7 @@ def _read_ply(path: Path, rows: _Rows, unit: Unit | None) -> tuple[PointCloud, i
     chosen, warnings = omit_points(points, {})
     points, vertices = points[chosen], vertices[chosen]
     uncertainty = _read_uncertainty(known, lambda name: column(name, np.nan))
-    lean = [name for name in ("random_std", "common_std") if name in known and uncertainty is None]
+    lean = known if uncertainty is None else ()
     deviation = column("deviation", np.nan)
     metadata, uncertainty = _split_shared(_read_metadata(comments), uncertainty)
     named, doubts = "mm", list[str]()

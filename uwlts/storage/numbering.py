@@ -38,7 +38,7 @@ def count_names(names: Sequence[str], *, series: bool = False) -> Counted | None
     """Return the increasing numbers of images in their names.
 
     The names differ in one number, or in several; then the one with the fewest gaps counts, or one with a decimal point
-    and less gaps than images. None if no number counts, as in names without digits and in times. ``series``: numbers
+    and fewer gaps than images. None if no number counts, as in names without digits and in times. ``series``: numbers
     may start again, as for poses in a list of their own.
 
     Raises DescriptionError for a mixture of naming, a number that occurs twice, and numbers that decrease or restart.
