@@ -265,11 +265,10 @@ class _Process:
             self._process.join(_GRACE_S)
             code = self._process.exitcode
             how = f"signal {signal.Signals(-code).name}" if code is not None and code < 0 else f"exit code {code}"
-            return Lost(
-                f"a worker process has ended unexpectedly ({how}), perhaps due to lack of memory: run "
-                "fewer workers at a time",
-                by_error=code == 1,  # Python's exit code after an exception.
-            )
+            why = "perhaps due to lack of memory: run fewer workers at a time"
+            if by_error := code == 1:  # Python's exit code after an exception.
+                why = 'by the error printed above; a script must call this under `if __name__ == "__main__":`'
+            return Lost(f"a worker process has ended unexpectedly ({how}), {why}", by_error)
 
     def stop(self, *, at_once: bool) -> None:
         """Ask the process to end, after its job or at once."""
