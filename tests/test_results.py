@@ -201,6 +201,9 @@ def test_only_changed_code_makes_a_table_old(project, monkeypatch, capsys):
 
     assert digests(CODE.replace("Return 1", "Return one").replace("# Reason", "# Another reason")) == before
     assert all(new != old for new, old in zip(digests(CODE.replace("return 1", "return 2")), before, strict=True))
+    (compiled := path.parent / "__pycache__").mkdir()
+    (compiled / "one.kernel-1.py311.1.nbc").write_bytes(b"compiled by Numba")
+    assert digests(CODE) == before
     (project / "study.py").write_text("import numpy\n")
     assert digests(CODE)[0] == before[0] and digests(CODE)[1] != before[1]
 

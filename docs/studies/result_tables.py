@@ -89,7 +89,8 @@ def _digest(folder: str) -> str:
     if not path.exists():
         raise SystemExit(f"error: {LIST.name} names the code {folder}, which does not exist")
     for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
-        if file.is_file() and file.suffix != ".pyc":
+        # Python and Numba keep compiled code beside the source.
+        if file.is_file() and file.parent.name != "__pycache__":
             total.update(str(file.relative_to(ROOT)).encode() + b"\n" + PROSE.sub(b"", file.read_bytes()))
     return total.hexdigest()
 
