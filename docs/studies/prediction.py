@@ -1,6 +1,7 @@
 """Predictions for drawn sensors, against the errors and detection limits of campaigns that they have not seen.
 
     python -m docs.studies.prediction runs/prediction --sensors 30 --write
+    python -m docs.studies.prediction runs/steps --sensors 24 --first-seed 8400 --scans step-scan
     python -m docs.studies.prediction detection runs/detection --write
 
 Lens, baseline, angle, window and water of each sensor are drawn, and the deviations of the built sensor. Two campaigns
@@ -43,6 +44,8 @@ RECORDINGS: list[dict[str, Any]] = [
     {"name": "pits", "scene": "pits.toml", "motion": {"start_mm": -24.0, "step_mm": 1.0, "count": 49}},
     {"name": "undercut", "scene": "undercut", "motion": {"step_mm": 2.0, "count": 13}},
 ]
+CALIBRATION = 4
+"""Number of the first recordings, which calibrate; the others are scans."""
 UNCERTAINTY = {
     "window_distance_mm": 7.0,
     "window_tilt_deg": 0.1,
@@ -129,8 +132,11 @@ def draw(seed: int) -> tuple[Sensor, Sensor, float]:
     return sensor, validate_description(Sensor, merge_tables(sensor.model_dump(), deviations), "built"), turbidity
 
 
-def predict(folder: Path, seed: int) -> dict[str, Any]:
-    """Render and evaluate the campaigns of a drawn sensor; return a prediction of each, or why one failed."""
+def predict(folder: Path, seed: int, scans: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Render and evaluate the campaigns of a drawn sensor; return a prediction of each, or why one failed.
+
+    Of the scans, those named are recorded; by default all.
+    """
     place = folder / f"sensor-{seed}"
     place.mkdir(parents=True, exist_ok=True)
     sensor, built, turbidity = draw(seed)
@@ -140,7 +146,9 @@ def predict(folder: Path, seed: int) -> dict[str, Any]:
     for name, scene in SCENES.items():
         (place / f"{name}.toml").write_text(tomli_w.dumps(scene), encoding="utf-8")
     campaign = {"base": "thesis", "title": f"drawn {seed}", "sensor": "sensor.toml", "as_built": "built.toml"}
-    campaign |= {"water": turbidity, "imperfections": IMPERFECTIONS, "recordings": RECORDINGS}
+    campaign |= {"water": turbidity, "imperfections": IMPERFECTIONS}
+    chosen = [each for each in RECORDINGS[CALIBRATION:] if each["name"] in scans or not scans]
+    campaign["recordings"] = [*RECORDINGS[:CALIBRATION], *chosen]
     (place / "campaign.toml").write_text(tomli_w.dumps(campaign), encoding="utf-8")
     drawn = {"seed": seed, "sensor": sensor.model_dump(mode="json"), "turbidity": turbidity}
     try:
@@ -205,14 +213,16 @@ def detection_cells(sensors: list[list[ExperimentResult]]) -> list[str]:
     return [f"{len(ratios)}", f"{min(counts)} to {max(counts)}", ratio, f"{within} of {len(ratios)}"]
 
 
-def main(folder: Path, *, sensors: int = 30, first_seed: int = 8000, write: bool = False) -> None:
-    """Render and compare; with `--write`, put the tables into their page."""
+def main(
+    folder: Path, *, sensors: int = 30, first_seed: int = 8000, scans: tuple[str, ...] = (), write: bool = False
+) -> None:
+    """Render and compare; with `--write`, put the tables into their page. With ``scans``, only these are recorded."""
     folder.mkdir(parents=True, exist_ok=True)
     found = []
     for seed in range(first_seed, first_seed + sensors):
         path = folder / f"{seed}.json"
         if not path.exists():
-            path.write_text(json.dumps(predict(folder, seed)), encoding="utf-8")
+            path.write_text(json.dumps(predict(folder, seed, scans)), encoding="utf-8")
         found.append(json.loads(path.read_text(encoding="utf-8")))
         print(seed, found[-1].get("failure", "done"), flush=True)
     done = [
@@ -221,9 +231,11 @@ def main(folder: Path, *, sensors: int = 30, first_seed: int = 8000, write: bool
         if "failure" not in sensor
     ]
     head = ["figure", "errors", "U predicted, mm", "error / stated, rms", "within U, %"]
-    errors = table(head, error_rows(compare_errors(done)))
-    head = ["sensors", "pits in a campaign", "a90 found / predicted, mean", "within 20 %"]
-    publish({"prediction": errors, "prediction of a90": table(head, [detection_cells(done)])}, write=write)
+    tables = {"prediction": table(head, error_rows(compare_errors(done)))}
+    if not scans:
+        head = ["sensors", "pits in a campaign", "a90 found / predicted, mean", "within 20 %"]
+        tables["prediction of a90"] = table(head, [detection_cells(done)])
+    publish(tables, write=write)
 
 
 def detect(folder: Path, *, every: int = 2, write: bool = False) -> None:
