@@ -353,7 +353,7 @@ def stated_variance(std_mm: float | None, *, known: bool, of: str) -> tuple[floa
     if std_mm is None:
         text = (
             f"no uncertainty of the {of} is known: the level of detection contains its scatter only, not the errors of "
-            f"the scanner's calibration. State their standard uncertainty ({name})"
+            f"the scanner's calibration. State their standard uncertainty (`{name}`)"
         )
         return 0.0, [] if known else [text]
     if not 0 <= std_mm < np.inf:

@@ -22,7 +22,7 @@ from cyclopts import App, Group, Parameter
 from uwlts._version import __version__
 from uwlts.argument_types import union_members
 from uwlts.errors import make_printable
-from uwlts.runtime.console import SWITCHES, progress_bar, replace_by_options
+from uwlts.runtime.console import SWITCHES, progress_bar, replace_by_options, warn
 
 _LISTENERS = ("progress", "report", "warn")  # parameters through which functions report; a command prints the reports
 
@@ -351,11 +351,5 @@ def say(line: str) -> None:
 
 
 def show(lines: Iterable[str]) -> None:
-    """Print lines."""
-    print(make_printable("\n".join(lines)))
-
-
-def warn(*texts: str) -> None:
-    """Print warnings on standard error."""
-    for text in texts:
-        print(make_printable(f"warning: {text}"), file=sys.stderr, flush=True)
+    """Print lines, with the command's options in place of parameters in backticks."""
+    print(make_printable(replace_by_options("\n".join(lines))))

@@ -28,6 +28,7 @@ SWITCHES = {
 _TABLE_WIDTH = 110  # characters, without a terminal
 _LINE_EVERY_S = 10.0  # interval between lines of progress without a terminal: a log of an hour stays readable
 _quiet = False
+_parameters: Collection[str] = ()  # names of the parameters of the command that runs
 _python_show_warning = warnings.showwarning
 
 
@@ -85,7 +86,7 @@ def _print_progress(title: str) -> ProgressListener:
 def _show_warning(message: Warning | str, category: type[Warning], *place: object, **more: object) -> None:
     """Print a warning on standard error as the commands do; without the line of code for those about descriptions."""
     if issubclass(category, DescriptionWarning):
-        print(make_printable(f"warning: {message}"), file=sys.stderr, flush=True)
+        warn(str(message))
     else:
         _python_show_warning(message, category, *place, **more)  # pyright: ignore[reportArgumentType]
 
@@ -95,7 +96,7 @@ def run(app: App) -> int:
 
     A wrong command line is explained on standard error like all errors.
     """
-    global _quiet
+    global _quiet, _parameters
     # Matrices are small here: threads for their products gain nothing, and delay each other when other programs run.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Scripts start background commands with SIGINT ignored, so that it could not stop a laser.
@@ -104,12 +105,12 @@ def run(app: App) -> int:
     arguments = sys.argv[1:]
     on = {name: not {*choices}.isdisjoint(arguments) for name, (choices, _) in SWITCHES.items()}
     switches = {word for choices, _ in SWITCHES.values() for word in choices}
-    _quiet, arguments = on["quiet"], [word for word in arguments if word not in switches]
-    command: object = None
+    _quiet, _parameters, arguments = on["quiet"], (), [word for word in arguments if word not in switches]
     try:
         with preserve_interrupts(), warnings.catch_warnings(), ExitStack() as output:
             warnings.showwarning = _show_warning
             command, bound, _ = app.parse_args(arguments, exit_on_error=False, print_error=False)
+            _parameters = inspect.signature(command).parameters
             if _quiet:
                 output.enter_context(redirect_stdout(output.enter_context(open(os.devnull, "w", encoding="utf-8"))))
             with protect_inputs(bound.arguments):
@@ -121,8 +122,7 @@ def run(app: App) -> int:
     except Error as error:
         if on["verbose"]:
             traceback.print_exc()
-        names = inspect.signature(command).parameters if callable(command) else ()
-        print(f"error: {replace_by_options(str(error), names)}", file=sys.stderr)
+        print(f"error: {replace_by_options(str(error))}", file=sys.stderr)
         return USER_ERROR
     except KeyboardInterrupt:
         print("interrupted; what is complete is kept: run it again, recordings with --resume", file=sys.stderr)
@@ -149,8 +149,15 @@ def _explain(error: CycloptsError, program: str) -> None:
     (error.console or Console(stderr=True)).print(CycloptsPanel(message))
 
 
-def replace_by_options(text: str, names: Collection[str]) -> str:
-    """Replace parameters in backticks by the command's options, for parameters with these names."""
+def warn(*texts: str) -> None:
+    """Print warnings on standard error, with the command's options in place of parameters in backticks."""
+    for text in texts:
+        print(make_printable(f"warning: {replace_by_options(text)}"), file=sys.stderr, flush=True)
+
+
+def replace_by_options(text: str, names: Collection[str] | None = None) -> str:
+    """Replace parameters in backticks by options; with ``names`` those of another command than the one that runs."""
+    names = _parameters if names is None else names
     return re.sub(
         r"(`+)(\w+)\1", lambda found: f"--{found[2].replace('_', '-')}" if found[2] in names else found[0], text
     )
