@@ -12,6 +12,8 @@ import re
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +45,14 @@ def spheres(cloud, stops: np.ndarray | None = None) -> tuple[list[str], np.ndarr
     centres = np.array([sphere["centre_mm"] for sphere in result.evaluation.spheres])
     shift = "-" if stops is None else f"{1e3 * float((centres - stops)[:, 0].mean()):+.1f}"
     return [f"{1e3 * result.sphere_spacing.value_mm:.1f}", shift], centres
+
+
+def later(
+    compare: Callable[..., tuple[float, int | None]], by_s: float, *about: object, **settings: object
+) -> tuple[float, int | None]:
+    """Return the comparison of clocks with the camera's ``by_s`` later."""
+    offset_s, encoder = compare(*about, **settings)
+    return offset_s + by_s, encoder
 
 
 def main(*, write: bool = False) -> None:
@@ -89,7 +99,7 @@ def main(*, write: bool = False) -> None:
             usual = recorder._compare_clocks
             for speed in SPEEDS_MM_S:
                 for shift in SHIFTS_S:
-                    recorder._compare_clocks = lambda *about, by=shift: ((found := usual(*about))[0] + by, found[1])
+                    recorder._compare_clocks = partial(later, usual, shift)
                     said_by: list[str] = []
                     moving = f"{{ speed_mm_per_s = {speed} }}"
                     uwlts.scan(

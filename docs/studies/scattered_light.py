@@ -34,12 +34,13 @@ DOCS = Path(__file__).resolve().parents[1]
 
 def make_renderer(water: str) -> "Renderer":
     """Return the renderer of two spheres in a named water."""
+    from twin.rendering_options import use_variant
+
+    use_variant()  # before Dr.Jit is imported, because it prepares libLLVM
     from tests.bench.light import in_named_water
     from twin.light.renderer import Renderer
-    from twin.rendering_options import use_variant
     from twin.scene.description import load_scene
 
-    use_variant()
     sensor = in_named_water(water)
     return Renderer(sensor, sensor.media["water"], load_scene("spheres"))
 
