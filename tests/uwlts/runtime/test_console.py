@@ -9,7 +9,7 @@ import pytest
 
 from uwlts.errors import Error
 from uwlts.runtime import console
-from uwlts.runtime.command_line import make_program
+from uwlts.runtime.command_line import make_program, show, warn
 
 _PROGRAM = """
 import sys, time
@@ -60,6 +60,11 @@ def _said(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
     def fail() -> None:
         raise Error("something is wrong")
 
+    @app.command
+    def doubt(*, cloud_std_mm: float = 0.0) -> None:
+        warn("give `cloud_std_mm`, see `uwlts.compare_clouds`")
+        show(["a result", "warning: `cloud_std_mm`"])
+
     clock = [0.0]
     monkeypatch.setattr(console.time, "monotonic", lambda: clock[0])
     monkeypatch.setattr(sys, "argv", ["x", *words])
@@ -87,3 +92,14 @@ def test_verbose_prints_the_traceback_of_an_error(monkeypatch, capsys):
     assert _said(monkeypatch, "fail", "-v") == 2
     said = capsys.readouterr().err
     assert said.startswith("Traceback") and said.endswith("error: something is wrong\n")
+
+
+def test_warnings_name_the_options_of_the_command_that_runs(monkeypatch, capsys):
+    assert _said(monkeypatch, "doubt") == 0
+    assert capsys.readouterr() == (
+        "a result\nwarning: --cloud-std-mm\n",
+        "warning: give --cloud-std-mm, see `uwlts.compare_clouds`\n",
+    )
+    assert _said(monkeypatch, "count") == 0
+    warn("`cloud_std_mm` is no parameter here")
+    assert capsys.readouterr().err.endswith("warning: `cloud_std_mm` is no parameter here\n")
