@@ -166,7 +166,7 @@ def other(
     camera = {"focus_distance_mm": baseline_mm / math.tan(angle), "stripe_along": along, "focal_length_mm": focal_mm}
     laser = {"baseline_mm": baseline_mm, "triangulation_angle_deg": angle_deg}
     laser |= {"waist_distance_mm": baseline_mm / math.sin(angle), "power_mw": detector.pop("power_mw", 7.0)}
-    # Scenes are drawn up to 40 mm nearer than the stand-off, of which that of `HIGH` is 234 mm.
+    # Scenes are drawn up to 40 mm nearer than the stand-off; that of `HIGH` is 234 mm.
     parts = {"camera": camera, "laser": laser, "detector": detector, "volume": {"near_mm": 150.0}}
     changed = {name: getattr(sensor, name).model_copy(update=values) for name, values in parts.items()}
     return Sensor.model_validate(sensor.model_copy(update=changed).model_dump())
