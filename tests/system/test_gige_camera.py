@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin.devices.gige_camera import PORT, GigeCamera
+from twin.devices.gige_camera import PORT, ExposedFrame, GigeCamera
 from uwlts.errors import HardwareError
 from uwlts.hardware.aravis import list_aravis_cameras
 from uwlts.hardware.camera_interface import FrameStatus
@@ -139,6 +139,25 @@ def test_free_running_frames_follow_each_other_past_the_end_of_the_counter(scene
     assert camera.counts.dropped == camera.counts.short == camera.counts.duplicated == 0
     # At least one period separates the frames, apart from the camera's clock, which ticks in whole milliseconds.
     assert frames[-1].time_s - frames[0].time_s > 19 / 50 - 2e-3 - 0.1
+
+
+def test_images_that_are_late_do_not_answer_a_trigger(scene):
+    def image(exposure_ms: float) -> np.ndarray:
+        time.sleep(0.2)
+        return scene.frame(exposure_ms)
+
+    slow = GigeCamera(scene.frame, expose=lambda: ExposedFrame(time.monotonic(), 0, image))
+    with slow as served, open_camera(served.address) as camera:
+        camera.configure(frame_rate_hz=50)
+        camera.start(faults="skip")
+        camera.grab(WAIT_S)
+        camera.stop()
+        # Some ten images wait to be made.
+        camera.configure(trigger="software")
+        camera.start(faults="skip")
+        asked_s = time.monotonic()
+        camera.trigger()
+        assert camera.grab(WAIT_S).time_s >= asked_s - 2e-3
 
 
 @pytest.mark.parametrize(

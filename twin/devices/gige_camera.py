@@ -73,8 +73,7 @@ def send_paced(stream: socket.socket, packets: list[bytes], to: tuple[str, int])
 
 _GENAPI = "http://www.genicam.org/GenApi/Version_1_0"
 LOOPBACK = "127.0.0.1"
-# GigE Vision's control port.
-PORT = 3956
+PORT = 3956  # GigE Vision's control port
 # Jumbo packets, as on a bench. With Aravis's 2000 bytes, an image has 670 packets.
 _PACKET_BYTES = 9000
 # Rate of checks for a trigger; commands are answered in between. At 1000 per s the thread would never sleep.
@@ -291,29 +290,27 @@ class GigeCamera:
 
     def _fill(self, _buffer: int, _data: None, exposure_us: int, _gain: int, _pixel_format: int) -> None:
         """Send a frame; the library calls this when a frame is due, and its own packets are dropped."""
-        if self._expose is not None and not self._library.arv_fake_camera_is_in_software_trigger_mode(self._camera):
+        if self._expose is not None and not self._is_triggered():
             self._stopping.wait(0.5e-6 * exposure_us)
             self._maker_thread.submit(self._develop, self._expose(), 1e-3 * exposure_us)
-            return
-        shot = self._choose_image(1e-3 * exposure_us)
-        if shot is not None:
+        elif (shot := self._choose_image(1e-3 * exposure_us)) is not None:
             self._send(shot)
 
     def _develop(self, exposed: ExposedFrame, exposure_ms: float) -> None:
-        """Make the image of an exposure and send it; called in order in the second thread."""
+        """Make the image of an exposure and send it, unless triggers follow by then; called in the second thread."""
         with self._lock:
-            if self._server is None or not self._read_register(_Register.ACQUISITION):
+            if self._server is None or not self._read_register(_Register.ACQUISITION) or self._is_triggered():
                 return
         try:
             image = exposed.image(exposure_ms)
         except BaseException as error:
             self.failure = error
             raise
-        self._send(_Shot(image, round(1e9 * exposed.middle_s - 0.5e6 * exposure_ms), exposed.encoder))
+        self._send(_Shot(image, round(1e9 * exposed.middle_s - 0.5e6 * exposure_ms), exposed.encoder), free=True)
 
-    def _send(self, shot: _Shot) -> None:
+    def _send(self, shot: _Shot, *, free: bool = False) -> None:
         with self._lock:
-            if self._server is None:
+            if self._server is None or (free and self._is_triggered()):
                 return
             if self._last is not None and self._apply_fault("repeat"):
                 shot = self._last
@@ -333,7 +330,7 @@ class GigeCamera:
 
     def _choose_image(self, exposure_ms: float) -> _Shot | None:
         """Return the image to send now; None while it is being made."""
-        triggered = bool(self._library.arv_fake_camera_is_in_software_trigger_mode(self._camera))
+        triggered = self._is_triggered()
         with self._lock:
             answer, self._answer = self._answer, None
             if answer is not None or self._server is None:
@@ -376,6 +373,9 @@ class GigeCamera:
         if image.shape != self._size or image.dtype != np.uint8:
             raise ImageError(f"the image is {image.shape} {image.dtype}; expected {self._size} uint8")
         return _Shot(image, began_ns, None if self._encoder is None else self._encoder())
+
+    def _is_triggered(self) -> bool:
+        return bool(self._library.arv_fake_camera_is_in_software_trigger_mode(self._camera))
 
     def _read_register(self, register: int) -> int:
         number = c_uint32()
