@@ -93,6 +93,7 @@ bench: setup
 
 # The cheapest studies run first. When it was stopped, it continues with the study that was stopped.
 results: setup
+	@$(PYTHON) -m pip install --quiet --editable '.[results]'
 	@$(WITH_ARAVIS)
 	@$(PYTHON) -m docs.studies.result_tables --run $(if $(STALE),--stale)
 

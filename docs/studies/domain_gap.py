@@ -1,7 +1,7 @@
 """Domain gap between rendered data sets and real photographs, exposure of the data sets, and pictures of both.
 
     python docs/studies/domain_gap.py FOLDER [PRESET ...] [--write]
-    python docs/studies/domain_gap.py FOLDER --classifier [--write]   # needs scikit-learn
+    python docs/studies/domain_gap.py FOLDER --classifier [--write]   # needs the extra results
     python docs/studies/domain_gap.py FOLDER [PRESET ...] --pictures
 
 Data sets in the folder are kept. The classifier has extremely randomised trees of grey values, gradients, spectra and
