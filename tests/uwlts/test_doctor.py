@@ -164,7 +164,7 @@ def test_absent_optional_libraries_are_optional_and_old_ones_a_warning():
 
 def test_every_extra_for_users_is_examined():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
-    assert extras.keys() - EXTRAS.keys() == {"docs", "test", "mutants"}
+    assert extras.keys() - EXTRAS.keys() == {"docs", "test", "mutants", "results"}
     assert EXTRAS.keys() <= extras.keys()
 
 
