@@ -1,4 +1,4 @@
-"""Predictions for drawn sensors, against the errors and detection limits of campaigns that they have not seen.
+"""Predictions for drawn sensors, against the errors and detection limits of other campaigns.
 
     python -m docs.studies.prediction runs/prediction --sensors 30 --write
     python -m docs.studies.prediction runs/steps --sensors 24 --first-seed 8400 --scans step-scan
@@ -32,11 +32,13 @@ IMAGE = {"width_px": 480, "height_px": 384}
 AIR = {"start_mm": -95.0, "step_mm": 27.0, "count": 8}
 WATER = {"start_mm": -70.0, "step_mm": 20.0, "count": 8}
 PLACES = {"near": {"position_mm": [0.0, 0.0, -30.0]}, "far": {"position_mm": [0.0, 0.0, 50.0]}}
-RECORDINGS: list[dict[str, Any]] = [
+CALIBRATIONS: list[dict[str, Any]] = [
     {"name": "target-bare", "scene": "target", "motion": AIR},
     {"name": "target-air", "scene": "target-through-window", "motion": AIR},
     {"name": "target-water", "scene": "target-through-window", "media": ["water"], "motion": WATER},
     {"scene": "step.toml", "placements": ["near", "far"]},
+]
+SCANS: list[dict[str, Any]] = [
     {"name": "spheres-near", "scene": "spheres.toml", "placements": ["near"]},
     {"name": "spheres-far", "scene": "spheres.toml", "placements": ["far"]},
     {"name": "step-scan", "scene": "step-scan", "motion": {"step_mm": 2.0, "count": 11}},
@@ -44,8 +46,6 @@ RECORDINGS: list[dict[str, Any]] = [
     {"name": "pits", "scene": "pits.toml", "motion": {"start_mm": -24.0, "step_mm": 1.0, "count": 49}},
     {"name": "undercut", "scene": "undercut", "motion": {"step_mm": 2.0, "count": 13}},
 ]
-CALIBRATION = 4
-"""Number of the first recordings, which calibrate; the others are scans."""
 UNCERTAINTY = {
     "window_distance_mm": 7.0,
     "window_tilt_deg": 0.1,
@@ -147,8 +147,7 @@ def predict(folder: Path, seed: int, scans: tuple[str, ...] = ()) -> dict[str, A
         (place / f"{name}.toml").write_text(tomli_w.dumps(scene), encoding="utf-8")
     campaign = {"base": "thesis", "title": f"drawn {seed}", "sensor": "sensor.toml", "as_built": "built.toml"}
     campaign |= {"water": turbidity, "imperfections": IMPERFECTIONS}
-    chosen = [each for each in RECORDINGS[CALIBRATION:] if each["name"] in scans or not scans]
-    campaign["recordings"] = [*RECORDINGS[:CALIBRATION], *chosen]
+    campaign["recordings"] = [*CALIBRATIONS, *(each for each in SCANS if each["name"] in scans or not scans)]
     (place / "campaign.toml").write_text(tomli_w.dumps(campaign), encoding="utf-8")
     drawn = {"seed": seed, "sensor": sensor.model_dump(mode="json"), "turbidity": turbidity}
     try:

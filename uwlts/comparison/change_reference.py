@@ -34,8 +34,8 @@ _MISFIT_STD = 5.0  # distance of a place from a fitted shape, in standard deviat
 _MISFIT_SIZE = 0.002
 """Least such distance, divided by the radius, or by half the extent of a plane: out of roundness of usual parts."""
 _MISFIT_SHARE = 0.4
-"""Share of departing places from which a surface is no such shape: local changes cover less of it. Judged on the tubes
-and bells of tests/uwlts/comparison/test_ideal_misfit.py."""
+"""A surface is no such shape if this share of its places or more departs: local changes cover less of it. Judged on the
+tubes and bells of tests/uwlts/comparison/test_ideal_misfit.py."""
 
 
 class _Shape(Description):
