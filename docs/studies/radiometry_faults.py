@@ -16,6 +16,7 @@ import twin
 import uwlts
 from docs.studies.radiometry import DARK_E_PER_MS, DESCRIBED, SCENE, SENSOR, draw
 from docs.studies.result_tables import publish, table
+from uwlts.radiometry.stripe_images import TAIL_PX
 
 JUDGED = ("power_reflectance_mw", "attenuation_per_m", "scattering_per_m", "sheet_radius_mm", "background_dn")
 """Values that the scan alone gives; gain and noise need repeated images."""
@@ -104,15 +105,23 @@ def measure(name: str, seed: int, folder: Path) -> Outcome:
         twin.simulate(scene, sensor=described, as_built=as_built, seed=seed, out=capture)
     found = uwlts.fit_radiometry(capture, uwlts.nominal(described, medium="water"))
     with uwlts.Capture(capture) as scan:
-        dark_e = DARK_E_PER_MS * float(np.median(scan.exposure_ms))
+        exposure_ms = float(np.median(scan.exposure_ms))
     gain = DESCRIBED["full_well"] / drawn["full_well"]
     truth = {
         "power_reflectance_mw": drawn["power"] * drawn["reflectance"] * fault.reflectance * fault.mean_grey * gain,
         "attenuation_per_m": drawn["absorption"] + drawn["scattering"],
         "scattering_per_m": drawn["scattering"],
         "sheet_radius_mm": drawn["waist"],
-        "background_dn": drawn["black"] + 4095 / drawn["full_well"] * dark_e,
+        "background_dn": drawn["black"] + 4095 / drawn["full_well"] * DARK_E_PER_MS * exposure_ms,
     }
+    if fault.light:
+        dark = capture.with_suffix(".dark.h5")
+        exposed = f"\n[exposure]\nlaser_ms = {exposure_ms}\n"
+        described.write_text(SENSOR.format(**DESCRIBED) + exposed)
+        as_built.write_text(SENSOR.format(**(built | {"power": 1e-9})) + exposed)
+        if not dark.exists():
+            twin.simulate(scene, sensor=described, as_built=as_built, seed=seed, out=dark)
+        truth["background_dn"] = measure_beside(capture, dark)
     states = {}
     for key in JUDGED:
         if not found[key].determined:
@@ -123,6 +132,17 @@ def measure(name: str, seed: int, folder: Path) -> Outcome:
     misfits = {part.part: round(part.misfit, 2) for part in found.parts}
     print(name, seed, states, "errors in %", errors, misfits, flush=True)
     return Outcome(tuple(part.part for part in found.parts if part.misfit > 1), states)
+
+
+def measure_beside(capture: Path, dark: Path) -> float:
+    """Return the mean grey value, in images without the laser, beside the stripe of the other capture."""
+    with uwlts.Capture(capture) as scan, uwlts.Capture(dark) as without:
+        means = []
+        for lit, other in zip(scan, without, strict=True):
+            stripe = np.argmax(cv2.GaussianBlur(lit.image, (0, 0), 3.0), axis=0)
+            distance = np.abs(np.arange(len(lit.image))[:, None] - stripe)
+            means.append(other.image[distance < TAIL_PX].mean())
+    return float(np.mean(means))
 
 
 def main(seeds: int = 5, *, first: int = 500, folder: Path | None = None, write: bool = False) -> None:

@@ -169,6 +169,7 @@ def verify(call: Call) -> None:
     """
     verification = call()
     show([verification.text, *verification.not_shown])
+    warn(*verification.warnings)
     say("pass" if verification.passed else "FAIL")
     try:
         say(f"wrote {verification.save(call.given['calibration'])}")

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwlts.model.calibration import Calibration
+from uwlts.model.calibration import Calibration, calibration_digest
 from uwlts.model.placement import laser_pose
 from uwlts.model.sensor import Laser, Sensor, Uncertainty, Vector
 from uwlts.model.stripe import CaptureStripes, stack_pixels
@@ -80,26 +80,19 @@ class IlluminatedPoints:
 
     @classmethod
     def from_calibration(
-        cls,
-        calibration: Calibration,
-        sensor: Sensor,
-        line: np.ndarray,
-        centre_px: np.ndarray,
-        *,
-        medium_index: float,
-        digest: str | None = None,
+        cls, calibration: Calibration, sensor: Sensor, line: np.ndarray, centre_px: np.ndarray, *, medium_index: float
     ) -> IlluminatedPoints:
-        """Locate stripe centres (N,) on profile lines (N,) on the sheet.
+        """Locate stripe centres (N,) on profile lines (N,) on the sheet; tables are kept for the next scan.
 
-        The window is ignored if the sensor's window is not mounted. With the calibration's ``digest``, interpolation
-        tables are kept for the next scan.
+        The window is ignored if the sensor's window is not mounted.
         """
+        digest = calibration_digest(calibration)
         if not sensor.camera.window.mounted:
             calibration = calibration.model_copy(update={"window": None})
         origin_mm = laser_pose(sensor).origin_mm
         known = _make_sheet_function(calibration, sensor.laser, origin_mm, medium_index=medium_index)
         laser = sensor.laser.model_dump_json(), origin_mm.tobytes()
-        key = None if digest is None else ("sheet", digest, sensor.camera.window.mounted, *laser, medium_index)
+        key = ("sheet", digest, sensor.camera.window.mounted, *laser, medium_index)
         status = np.full(len(line), RayStatus.OK, dtype=np.uint8)
 
         def exact(line: np.ndarray, place_px: np.ndarray) -> np.ndarray:

@@ -58,12 +58,14 @@ _OTHER_PHASES = (
 """Phase functions at the ends of what particles in natural water have: mean cosines of 0.85 to 0.95, and slopes with
 indices coupled by Mobley, Sundman and Boss (2002). The images rarely show which one it is."""
 _SCATTERING_STD = 0.04
-"""Relative standard uncertainty of the scattering coefficient by the model of the halo, for a known phase function.
-
-Both relative uncertainties were chosen on the captures 0 to 11 of docs/studies/radiometry.py, and judged on others."""
+"""Relative standard uncertainty of the scattering coefficient by the model of the halo, for a known phase function. It
+was chosen on the captures 0 to 11 of docs/studies/radiometry.py, and judged on others."""
 _WIDTH_STD, _WIDTH_BY_HALO = 0.01, 0.05
 """Relative standard uncertainty of the sheet's radius by the neglected light that is scattered by less than a pixel: a
 part, and one for each scattering length of path, chosen on seeds 0 to 9 of docs/studies/radiometry_faults.py."""
+_WIDTH_BY_SURFACE, _POWER_BY_SURFACE = 0.2, 0.07
+"""Relative standard uncertainties by light that enters a surface by up to 0.4 mm, which no halo shows: the sheet seems
+up to 40 % thicker, the stripe up to 13 % darker (seeds 2600 to 2605 of the same study)."""
 _LEAST_SIGMA_PX = 0.5
 """Least standard deviation of the sheet in the image for which its radius is separable from pixel and blur."""
 _CELL_PX = 6  # of the tail, whose mean residuals are judged; the halo falls by a third there at most
@@ -219,7 +221,7 @@ _TEXTS = {
     "attenuation_per_m": ("1/m", "beam attenuation of the water"),
     "scattering_per_m": ("1/m", "scattering by the water, for the described phase function"),
     "sheet_radius_mm": ("mm", "1/e² radius of the sheet at the surface"),
-    "background_dn": ("DN", "grey value without the stripe"),
+    "background_dn": ("DN", "grey value without the stripe, with daylight"),
     "stripe_sigma_px": ("px", "standard deviation of the stripe across, with blur"),
     "grain_contrast": ("", "contrast of the stripe's light along it"),
     "grain_length_lines": ("lines", "correlation length of this light along the stripe"),
@@ -308,8 +310,7 @@ class _Evidence:
     def estimate_with_covariance(self, attenuation_per_m: float | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return the estimates in the order of `_NAMES`, and their covariance; with a given attenuation, if any.
 
-        The covariance is that of the jackknife over the blocks, of the described profile of the fan, and of the model
-        of the halo: a fraction of the scattering.
+        The covariance is that of the jackknife over the blocks, of the described profile of the fan, and of the model.
         """
         every = np.ones(BLOCKS, bool)
         whole = self.estimate(every, attenuation_per_m)
@@ -318,10 +319,9 @@ class _Evidence:
         for fan in np.eye(2):
             moved = self.estimate(every, attenuation_per_m, fan=_FAN_STD * fan) - whole
             covariance += np.outer(moved, moved)
-        scattering, radius = _NAMES.index("scattering_per_m"), _NAMES.index("sheet_radius_mm")
-        covariance[scattering, scattering] += (_SCATTERING_STD * whole[scattering]) ** 2
-        wider = math.hypot(_WIDTH_STD, _WIDTH_BY_HALO * 1e-3 * self.path_mm * whole[scattering])
-        covariance[radius, radius] += (wider * whole[radius]) ** 2
+        wider = math.hypot(_WIDTH_STD, _WIDTH_BY_SURFACE, _WIDTH_BY_HALO * 1e-3 * self.path_mm * whole[2])
+        model = np.pad([_POWER_BY_SURFACE, 0.0, _SCATTERING_STD, wider], (0, len(_NAMES) - 4))
+        covariance += np.diag((model * whole) ** 2)
         return whole, covariance
 
     def estimate(
@@ -482,7 +482,6 @@ def _find_inseparable(
             a, b = (_TEXTS[_NAMES[k]][1] for k in (i, j))
             found.append(f"{a}, and {b}: correlated by {correlation[i, j]:.2f}")
     scattering = by_name["scattering_per_m"]
-    found.append("scattering and phase function, which is assumed: another one can change the coefficient fourfold")
     if scattering.value < 2 * scattering.std:
         most = scattering.value + 2 * scattering.std
         found.append(f"scattering and none: below {most:.2g}/m no halo is seen beside the stripe")
@@ -490,7 +489,4 @@ def _find_inseparable(
         found.append("gain, noise in the dark and speckle: repeat laser images at one position and exposure")
     if by_name["stripe_sigma_px"].value < _LEAST_SIGMA_PX:
         found.append("radius of the sheet and pixel: the stripe is narrower than a pixel, and the radius is its limit")
-    found.append("waist and focus of the sheet: only its radius at the surface; the described focus is kept")
-    found.append("sheet and a surface that light enters by up to 0.4 mm: it seems up to 40 % thicker")
-    found.append("background by dark current, black level and daylight: only their sum at this exposure")
     return tuple(found)

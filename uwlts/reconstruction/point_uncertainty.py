@@ -137,7 +137,6 @@ def point_uncertainty(
     blur_px: np.ndarray | float = 0.0,
     beside_mm: np.ndarray | float = 0.0,
     mount_by: np.ndarray | None = None,
-    digest: str | None = None,
     chosen: ErrorPatterns | None = None,
 ) -> PointUncertainty:
     """Calculate the uncertainty of points from stripe centres (N,) and a joint calibration.
@@ -153,8 +152,7 @@ def point_uncertainty(
     ``mount_by`` (6, P) are the derivatives of a calibrated mount by the parameters of the joint estimate
     (`uwlts.model.mount.SensorShare`), for frames with poses of a platform. They correlate the errors of points and
     mount. By default poses and described mount, or the stage, place the true OCS, from which the calibrated one differs
-    by the errors of camera axis and sheet. ``digest`` is that of the calibration, if known. Parts of one cloud have the
-    patterns ``chosen`` in common.
+    by the errors of camera axis and sheet. Parts of one cloud have the patterns ``chosen`` in common.
 
     CalibrationError if the calibration has no joint estimate, or cannot reconstruct the points.
     """
@@ -182,7 +180,7 @@ def point_uncertainty(
     rigid[0, -1] = window_shift_std_mm(sensor) if mount_by is None else 0.0
     exact = partial(_compute_derivatives, known, root, rigid)
     of_estimate = tuple(array.tobytes() for array in (known.values, root, rigid))
-    key = None if digest is None else ("uncertainty", digest, known.view, *of_estimate)
+    key = ("uncertainty", calibration_digest(calibration), known.view, *of_estimate)
     table = LineTable.over_range(exact, line, centre_px, tolerance=_TABLE_TOLERANCE_MM, key=key)
     beside = np.zeros((len(line), 3)) + brightness_shift_std(header.sensor.uncertainty) * beside_mm
     # Blur shifts the centres on steep surfaces, the place in the pixel those on level ones: they share a pattern.
@@ -219,7 +217,7 @@ def point_uncertainty(
     position = np.where(posed[:, :, 0], 0.0, along).astype(np.float32)
     position = position[frame] if posed.any() else np.broadcast_to(position[:1], (len(frame), 3))
     # Except for shifts of the centres, the errors of sensor, stage and water are common to all scans in this medium.
-    source = f"{digest or calibration_digest(calibration)} {header.medium_name} {header.stage_direction}"
+    source = f"{calibration_digest(calibration)} {header.medium_name} {header.stage_direction}"
     name = sha256(source.encode()).hexdigest()[:16]
     shared = {f"{WATER} {name}": weights[2:3].T, f"sensor {name}": np.delete(weights, [0, 2], axis=0).T}
     return PointUncertainty(random, position, patterns, shared=shared)

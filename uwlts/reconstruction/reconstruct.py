@@ -248,11 +248,10 @@ def reconstruct_stripes(
         blurred = len(stripes.line) - len(sharp)
         lines = lines | {"ok": lines.get("ok", 0) - blurred, "blurred": blurred}
         stripes = stripes[sharp]
-    digest = calibration_digest(calibration)
     sheet = None  # with poses or a polynomial calibration
     if by_stage and isinstance(calibration, Calibration):
         seen = capture.header.sensor, stripes.line, stripes.centre_px
-        sheet = IlluminatedPoints.from_calibration(calibration, *seen, medium_index=index, digest=digest)
+        sheet = IlluminatedPoints.from_calibration(calibration, *seen, medium_index=index)
     found = _triangulate(capture, calibration, stripes, index, sheet)
     beside, points = np.zeros((len(sharp), 3)), found.points_mm
     if exact is not None and sheet is not None:
@@ -269,7 +268,7 @@ def reconstruct_stripes(
             raise CalibrationError("the calibration states no uncertainty: calibrate jointly (`water` or `joint`)")
         centres = kept.frame, kept.line, kept.centre_px
         moved = {"width_px": kept.width_px, "blur_px": blur[good], "beside_mm": beside[good]}
-        known = point_uncertainty(capture, exact, centres, **moved, mount_by=mount_by, chosen=chosen, digest=digest)
+        known = point_uncertainty(capture, exact, centres, **moved, mount_by=mount_by, chosen=chosen)
     rays = np.bincount(found.status, minlength=len(RayStatus))
     return PointCloud(
         points_mm=points[good],
@@ -283,7 +282,7 @@ def reconstruct_stripes(
             "medium": capture.header.medium_name,
             "medium_index": index,
             "artefact": capture.header.artefact,
-            "calibration": digest,
+            "calibration": calibration_digest(calibration),
             "images": len(capture.stage_mm),
             **{key: value for key, value in capture.header.provenance.items() if key == "scene"},
             **({EDITED: "calibration"} if EDITED in calibration.provenance else {}),

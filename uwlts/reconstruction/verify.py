@@ -1,5 +1,6 @@
 """Field verification: measurement of a calibrated artefact and comparison with its certificate."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -21,8 +22,7 @@ from uwlts.storage.capture import Capture, open_capture
 class Verdict:
     """Result for one calibrated quantity, mm.
 
-    The ``expanded`` values are expanded uncertainties (k = 2), None if unknown. ``limit_mm`` is the maximum permissible
-    error, if any.
+    Expanded uncertainties (k = 2) are None if unknown. ``limit_mm`` is the maximum permissible error, if any.
     """
 
     quantity: str
@@ -70,13 +70,14 @@ class Verdict:
 class Verification:
     """Results for all calibrated quantities of an artefact, the share of other points, and errors that it cannot show.
 
-    ``capture`` is its name, and ``calibration`` the digest of the calibration.
+    ``capture`` is its name, ``calibration`` the calibration's digest, and ``warnings`` those of the reconstruction.
     """
 
     verdicts: tuple[Verdict, ...]
     not_shown: tuple[str, ...] = ()
     capture: str = ""
     calibration: str = ""
+    warnings: Sequence[str] = ()
 
     @property
     def passed(self) -> bool:
@@ -168,7 +169,7 @@ def verify(
         f"{100 * counts.strange_share:.1f} % of the points do not belong to the artefact; "
         f"{100 * outliers:.1f} % of its own are outliers (VDI/VDE 2634 allows 0.3 %)"
     )
-    return Verification(verdicts, (share, *not_shown), scan.path.name, calibration_digest(calibration))
+    return Verification(verdicts, (share, *not_shown), scan.path.name, calibration_digest(calibration), cloud.warnings)
 
 
 _ACROSS = 0.1

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import JsonValue
 from scipy.spatial.transform import Rotation
 
-from uwlts.errors import CaptureError
+from uwlts.errors import CaptureError, Error
 from uwlts.evaluation.evaluate import FORMAT as EVALUATION, Evaluation, read_evaluation
 from uwlts.files.json_files import numbers_in, read_json
 from uwlts.files.reading import MOST_TOML_BYTES, is_regular_file, parse_toml, read_text, require_regular_file
@@ -52,9 +52,8 @@ def read(
 ) -> _Readable:
     """Read a file of the program, whose content determines the type of the result.
 
-    The result is of the class that was saved, or an opened capture. Text with times and rotations is a trajectory.
-    The metadata of a capture's frames are read at once, and images on demand: ``capture[12]`` is a `Frame`. A recording
-    in progress can be opened by its name ``NAME.part``. Close a capture, or use it as a context manager.
+    Text with times and rotations is a trajectory. The metadata of a capture's frames are read at once, and images on
+    demand: ``capture[12]`` is a `Frame`. A recording in progress can be opened by its name ``NAME.part``.
 
     Parameters
     ----------
@@ -119,8 +118,12 @@ _DESCRIPTIONS = (
     ("description of a folder of images", ({"stage", "sensor"},), "uwlts import"),
     ("target", ({"kind", "columns", "rows"},), "uwlts import and uwlts camera --target"),
     ("order of a report", ({"datum"}, {"client"}, {"limits"}), "uwlts findings-report --order"),
+    ("result of an experiment", ({"campaign", "water"},), "twin.experiment"),
+    ("plan of an experiment", ({"campaign", "every"},), "twin experiment, which resumes it"),
+    ("result of a verification", ({"calibration", "passed"},), "uwlts reconstruct"),
+    ("card of a data set", ({"licence", "seed"},), "uwlts.load_dataset"),
 )
-"""Kinds of descriptions in the order of recognition, alternative keys, and the command that uses them."""
+"""Kinds of descriptions and results in the order of recognition, alternative keys, and what uses them."""
 
 
 def describe(path: str | Path, *, unit: Unit | None = None, pose_format: PoseFormat = SAVED_FORMAT) -> str:
@@ -129,7 +132,7 @@ def describe(path: str | Path, *, unit: Unit | None = None, pose_format: PoseFor
     Parameters
     ----------
     path : str or Path
-        File, or name of a shipped sensor such as thesis.
+        File, folder, or name of a shipped sensor such as thesis.
     unit : {"mm", "m"}, optional
         As for `export`.
     pose_format : str
@@ -147,9 +150,13 @@ def describe(path: str | Path, *, unit: Unit | None = None, pose_format: PoseFor
     """
     name, path = str(path), Path(path)
     endings = [each for each in path.suffixes if each != ".part"]
-    if (not endings and not path.is_dir()) or endings[-1:] == [".toml"]:
-        lines = _name_description(path) or sensor_lines(load_sensor(name))
-    elif endings[-2:] == [".truth", ".h5"] or (endings[-1:] == [".h5"] and read_format(path) == TRUTH):
+    if path.is_dir() and pose_format == SAVED_FORMAT:
+        lines = [f"{each.name}: {_summarise(each)}" for each in sorted(path.iterdir())]
+    elif named := _name_description(path):
+        lines = named
+    elif (not endings and not path.is_dir()) or endings[-1:] == [".toml"]:
+        lines = sensor_lines(load_sensor(name))
+    elif endings[-1:] == [".h5"] and read_format(path) == TRUTH:
         lines = truth_lines(*read_truth(path))
     else:
         try:
@@ -159,12 +166,22 @@ def describe(path: str | Path, *, unit: Unit | None = None, pose_format: PoseFor
     return "\n".join(lines)
 
 
+def _summarise(path: Path) -> str:
+    """Return the first line of a file's description."""
+    with suppress(Error):
+        return "folder" if path.is_dir() else describe(path).partition("\n")[0]
+    return "not a file that `uwlts info` describes"
+
+
 def _name_description(path: Path) -> list[str]:
-    """Return what a description other than a sensor's is, by its keys; empty for a sensor or none of them."""
+    """Return what a description or JSON without a reader is, by its keys; empty for a sensor or none of them."""
     table: dict[str, JsonValue] = {}
     if path.suffix == ".toml" and is_regular_file(path):
         with suppress(ValueError):
             table = parse_toml(read_text(path, most_bytes=MOST_TOML_BYTES, called="description"))
+    elif path.suffix == ".json":
+        found = read_json(path, called="file of this program", check_seal=False)
+        table = {} if str(found.get("format")) in _JSON_READERS else found
     for kind, some, command in _DESCRIPTIONS:
         if any(table.keys() >= keys for keys in some):
             title = table.get("title") or table.get("name")
@@ -173,24 +190,10 @@ def _name_description(path: Path) -> list[str]:
 
 
 def _describe_content(found: object) -> list[str]:
-    match found:
-        case Capture():
-            with found:
-                return capture_lines(found)
-        case Calibration():
-            return calibration_lines(found)
-        case PolynomialCalibration():
-            return polynomial_lines(found)
-        case Evaluation():
-            return evaluation_lines(found)
-        case Mount():
-            return mount_lines(found)
-        case PointCloud():
-            return cloud_lines(found)
-        case Trajectory():
-            return trajectory_lines(found)
-        case _:
-            return repr(found).splitlines()
+    if isinstance(found, Capture):
+        with found:
+            return capture_lines(found)
+    return _LINES.get(type(found), lambda other: repr(other).splitlines())(found)
 
 
 def capture_lines(capture: Capture) -> list[str]:
@@ -278,9 +281,8 @@ def calibration_lines(calibration: Calibration) -> list[str]:
         view = "" if calibration.medium_kind == "air" else ", as seen from a single viewpoint"
         lines.append(f"window: none; for use in {kind} only{view}")
     else:
-        glass = (
-            f", glass {window.thickness_mm:g} mm of index {window.glass_index:.4f}" if window.refractions == 2 else ""
-        )
+        glass = f", glass {window.thickness_mm:g} mm of index {window.glass_index:.4f}"
+        glass = glass if window.refractions == 2 else ""
         lines.append(
             f"window: {window.refractions} refraction(s), {window.distance_mm:.3f} mm from the entrance pupil{glass}"
         )
@@ -438,7 +440,7 @@ def evaluation_lines(record: Evaluation) -> list[str]:
 
 
 def sensor_lines(sensor: Sensor) -> list[str]:
-    """Describe the views of a sensor in each of its media, and the line length for both camera orientations."""
+    """Describe the views of a sensor in each of its media."""
     laser = sensor.laser
     lines = [f"sensor '{sensor.name}': {sensor.notes}", f"image {sensor.camera.width_px} x {sensor.camera.height_px}"]
     if laser.baseline_mm is not None:
@@ -449,12 +451,8 @@ def sensor_lines(sensor: Sensor) -> list[str]:
             f"{name} ({_describe(medium, sensor)}): stand-off {view.standoff_mm:.1f} mm outside the window, sheet in "
             f"view from {view.nearest_mm:.1f} to {view.farthest_mm:.1f} mm"
         )
-        for along, side in (("width", sensor.camera.width_px), ("height", sensor.camera.height_px)):
-            camera = sensor.camera.model_copy(update={"stripe_along": along})
-            turned = sensor.model_copy(update={"camera": camera})
-            length = view_of_sheet(turned, medium).line_length_mm
-            chosen = " (this sensor)" if along == sensor.camera.stripe_along else ""
-            lines.append(f"  line length at the stand-off, stripe along the {side} side: {length:.1f} mm{chosen}")
+        length, along = view_of_sheet(sensor, medium).line_length_mm, sensor.camera.stripe_along
+        lines.append(f"  line length at the stand-off, stripe along the {along} side: {length:.1f} mm")
     return lines
 
 
@@ -462,3 +460,13 @@ def _describe(medium: Medium, sensor: Sensor) -> str:
     index = medium.refractive_index(sensor.laser.wavelength_nm)
     water = f", {medium.temperature_c:g} degC, {medium.salinity_g_kg:g} g/kg" if medium.kind in ("fresh", "sea") else ""
     return f"{medium.kind}, n {index:.5f}{water}"
+
+
+_LINES: dict[type, Callable[..., list[str]]] = {
+    Calibration: calibration_lines,
+    PolynomialCalibration: polynomial_lines,
+    Evaluation: evaluation_lines,
+    Mount: mount_lines,
+    PointCloud: cloud_lines,
+    Trajectory: trajectory_lines,
+}

@@ -130,8 +130,13 @@ def run(app: App) -> int:
     except BrokenPipeError:
         # The reader has closed the pipe; Python must not try to write the rest when it ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except OSError as error:
-        print(make_printable(f"error: {error.strerror or error}: {error.filename}"), file=sys.stderr)
+    except (OSError, ImportError, MemoryError) as error:
+        if on["verbose"]:
+            traceback.print_exc()
+        text = f"{error}: too little memory? See also `uwlts doctor`"
+        if isinstance(error, OSError) and error.strerror:
+            text = f"{error.strerror}: {error.filename}"
+        print(make_printable(f"error: {text}"), file=sys.stderr)
         return USER_ERROR
     return 0
 

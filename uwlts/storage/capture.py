@@ -283,7 +283,8 @@ class Capture(AbstractContextManager["Capture"]):
         try:
             return read_values(self._images, index)
         except DAMAGE as error:
-            raise CaptureError(f"frame {index} of {self.path} cannot be read: the file is damaged ({error})") from error
+            why = f"the file is damaged, or there is too little memory ({error})"
+            raise CaptureError(f"frame {index} of {self.path} cannot be read: {why}") from error
 
     def __getitem__(self, index: int) -> Frame:
         """Return a frame with its metadata; raises CaptureError if its data are damaged."""

@@ -1,5 +1,7 @@
 """Warnings and limits that a verification reports beside its verdicts."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -71,9 +73,11 @@ def test_a_scan_with_half_of_another_one_verifies_nothing(tmp_path, monkeypatch)
         for number in range(3):
             writer.append(Frame(image, stage_mm=number, laser_on=True, exposure_ms=1.0, time_s=number))
     calibration = nominal_calibration(header.sensor)
-    clouds = iter([cloud_with_others(0.2), cloud_with_others(0.5)])
+    doubted = replace(cloud_with_others(0.2), warnings=["exchanged images"])
+    clouds = iter([doubted, cloud_with_others(0.5)])
     monkeypatch.setattr("uwlts.reconstruction.verify.reconstruct", lambda *_: next(clouds))
     found = uwlts.verify(tmp_path / "scan.h5", calibration, limit_mm=0.1)
     assert found.passed and found.not_shown[0].startswith("20.")
+    assert found.warnings == ["exchanged images"]
     with pytest.raises(EvaluationError, match="nothing is verified: 50 % of the points do not belong"):
         uwlts.verify(tmp_path / "scan.h5", calibration, limit_mm=0.1)

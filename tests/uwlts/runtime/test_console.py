@@ -61,6 +61,10 @@ def _said(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
         raise Error("something is wrong")
 
     @app.command
+    def load(*, memory: bool) -> None:
+        raise MemoryError("Unable to allocate 24 MiB") if memory else ImportError("a.so: failed to map segment")
+
+    @app.command
     def doubt(*, cloud_std_mm: float = 0.0) -> None:
         warn("give `cloud_std_mm`, see `uwlts.compare_clouds`")
         show(["a result", "warning: `cloud_std_mm`"])
@@ -92,6 +96,16 @@ def test_verbose_prints_the_traceback_of_an_error(monkeypatch, capsys):
     assert _said(monkeypatch, "fail", "-v") == 2
     said = capsys.readouterr().err
     assert said.startswith("Traceback") and said.endswith("error: something is wrong\n")
+
+
+@pytest.mark.parametrize(
+    ("option", "found"), [("--memory", "Unable to allocate 24 MiB"), ("--no-memory", "a.so: failed to map segment")]
+)
+def test_too_little_memory_for_data_or_libraries_is_a_users_error(monkeypatch, capsys, option, found):
+    assert _said(monkeypatch, "load", option) == 2
+    assert capsys.readouterr().err == f"error: {found}: too little memory? See also `uwlts doctor`\n"
+    assert _said(monkeypatch, "load", option, "-v") == 2
+    assert capsys.readouterr().err.startswith("Traceback")
 
 
 def test_warnings_name_the_options_of_the_command_that_runs(monkeypatch, capsys):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwlts.errors import RangeError
+from uwlts.errors import CalibrationError
 from uwlts.targets.detection.ellipses import circle_centre_bias
 
 FOCAL, CENTRE = 2450.0, (639.5, 511.5)
@@ -78,11 +78,11 @@ def test_square_on_without_distortion_there_is_no_bias_and_distortion_makes_one(
     [
         (rotation(0, 0), [np.nan, 0, 0], "cannot be projected"),
         # The circle spans the plane z = 0 of the camera: its image is a hyperbola.
-        (rotation(90, 0), [0, -300.0, 0], "not ellipses"),
+        (rotation(90, 0), [0, -300.0, 0], "no ellipses"),
     ],
 )
 def test_impossible_requests_are_refused(turn, centre, message):
-    with pytest.raises(RangeError, match=message):
+    with pytest.raises(CalibrationError, match=message):
         circle_centre_bias(pinhole(turn, np.array([1.0, 20.0, 301.0])), [centre], diameter_mm=40.0)
 
 

@@ -273,7 +273,7 @@ def centre_offsets(
     The circles are in the plane of a target at ``T_camera_target`` (4, 4); ``project`` maps points (M, 3) of the camera
     frame to pixels (M, 2).
 
-    Raises RangeError if a circle's image is not an ellipse.
+    Raises CalibrationError if a circle's image is not an ellipse, as in a fit that diverged.
     """
     return circle_centre_bias(
         lambda points: project(points @ pose[:3, :3].T + pose[:3, 3]), points_mm, diameter_mm=diameter_mm

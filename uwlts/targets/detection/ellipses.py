@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import KDTree
 
-from uwlts.errors import RangeError
+from uwlts.errors import CalibrationError
 from uwlts.runtime.compiled import compiled, compiled_part, compiled_with_arrays
 from uwlts.targets.detection.blobs import Blobs, check_grey, estimate_noise, find_blobs
 
@@ -399,8 +399,8 @@ def circle_centre_bias(project, centres_mm, *, diameter_mm):
     ``project`` maps points (M, 3) in mm, target frame, to pixels (M, 2). The circles with ``centres_mm`` (N, 3) are in
     planes of constant z. Returns (N, 2) float64, (u, v) in px.
 
-    Raises RangeError if the image of a circle is not an ellipse: the circle extends behind the camera, or ``project``
-    fails.
+    Raises CalibrationError if the image of a circle is not an ellipse: the circle extends behind the camera, or
+    ``project`` fails, as in a fit that diverged.
     """
     centres = np.asarray(centres_mm, float).reshape(-1, 3)
     if len(centres) == 0:
@@ -411,9 +411,9 @@ def circle_centre_bias(project, centres_mm, *, diameter_mm):
     pixels = np.asarray(project(points.reshape(-1, 3)), float).reshape(len(centres), RIM_POINTS + 1, 2)
     broken = ~np.isfinite(pixels).all((1, 2))
     if broken.any():
-        raise RangeError(
-            f"{broken.sum()} of {len(centres)} circles cannot be projected, the first at {centres[broken][0]} mm; "
-            "remove circles that the camera cannot see"
+        raise CalibrationError(
+            f"{broken.sum()} of {len(centres)} circles cannot be projected, the first at {centres[broken][0]} mm: the "
+            "images do not fit the described target and sensor, or the camera cannot see these circles"
         )
     return _fit_centres(pixels[:, 1:]) - pixels[:, 0]
 
@@ -423,15 +423,13 @@ def _fit_centres(points):
     middle = points.mean(1, keepdims=True)
     scale = np.sqrt(((points - middle) ** 2).mean((1, 2), keepdims=True))
     if (scale == 0).any():
-        raise RangeError(f"{np.count_nonzero(scale == 0)} circles are imaged onto a single point; expected ellipses")
+        raise CalibrationError(f"{np.count_nonzero(scale == 0)} circles are imaged onto a single point, not an ellipse")
     x, y = np.moveaxis((points - middle) / scale, 2, 0)
     design = np.stack([x * x, x * y, y * y, x, y, np.ones_like(x)], 2)
     a, b, c, d, e, _ = np.linalg.eigh(design.swapaxes(1, 2) @ design)[1][:, :, 0].T
     determinant = 4 * a * c - b * b
     if not (determinant > 0).all():
-        raise RangeError(
-            f"the images of {np.count_nonzero(determinant <= 0)} of {len(points)} circles are not ellipses; remove "
-            "circles that extend behind the camera"
-        )
+        count = np.count_nonzero(determinant <= 0)
+        raise CalibrationError(f"{count} of {len(points)} circles extend behind the camera: no ellipses in the image")
     centre = np.stack([b * e - 2 * c * d, b * d - 2 * a * e], 1) / determinant[:, None]
     return middle[:, 0] + scale[:, 0] * centre

@@ -16,7 +16,7 @@ from uwlts.calibration.camera.camera_parameters import (
     placements,
     z_away,
 )
-from uwlts.calibration.camera.target_poses import direct_linear, solve_camera, stage_direction
+from uwlts.calibration.camera.target_poses import centre_offsets, direct_linear, solve_camera, stage_direction
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.fitting.schur_least_squares import schur_least_squares
 
@@ -309,6 +309,13 @@ def test_the_offset_of_circle_images_is_taken_out(monkeypatch):
     assert unbiased.rms_px() < 1e-5 < biased.rms_px()
     largest = max(np.hypot(*(i.pixels - centres(matrix, i.stage_mm, points)).T).max() for i in images)
     assert float(np.linalg.norm(np.vstack(unbiased.bias_px), axis=1).max()) == pytest.approx(largest, rel=1e-3)
+
+
+def test_a_fit_that_leaves_circles_out_of_view_does_not_fit():
+    """A trial fit that diverges is a calibration that fails, which another lens may replace."""
+    points = lattice(2, 2)
+    with pytest.raises(CalibrationError, match="4 of 4 circles cannot be projected"):
+        centre_offsets(lambda seen: np.full((len(seen), 2), np.nan), circle_pose(0.0), points, diameter_mm=5.0)
 
 
 def test_contradictory_stage_directions_are_refused():
