@@ -12,6 +12,7 @@ from pydantic import BeforeValidator, Field, PrivateAttr, ValidationInfo, field_
 from scipy.special import ndtr, ndtri
 
 from twin.rendering_options import Effects, Flaws, Options
+from twin.scene.campaign import AnySensor, choose_sensors
 from twin.scene.description import AnyMotion, NamedSensor, PrintedPlate, Scene, Value, load_scene, value_at
 from uwlts.errors import DescriptionError
 from uwlts.files.reading import is_regular_file
@@ -62,19 +63,11 @@ FAINT_BELOW = 3.0
 detection requires 5 to 6 (A. Rose, J. Opt. Soc. Am. 38, 196, 1948)."""
 
 
-class Constant(Description):
-    """Constant value. The ``quantile`` of a distribution is the inverse of its cumulative distribution function."""
-
-    kind: Literal["constant"]
-    value: Value
-
-    def quantile(self, share: float) -> Value:
-        """Return the value."""
-        return self.value
-
-
 class OneOf(Description):
-    """One of several values, with probabilities proportional to ``weights``, by default equal."""
+    """One of several values, with probabilities proportional to ``weights``, by default equal.
+
+    The ``quantile`` of a distribution is the inverse of its cumulative distribution function.
+    """
 
     kind: Literal["choice"]
     values: Annotated[tuple[Value, ...], Field(min_length=1)]
@@ -143,7 +136,7 @@ class Normal(Description):
         return low, 1.0 if self.most is None else float(ndtr((self.most - self.mean) / self.std))
 
 
-AnyDistribution = Annotated[Constant | OneOf | Uniform | Normal, Field(discriminator="kind")]
+AnyDistribution = Annotated[OneOf | Uniform | Normal, Field(discriminator="kind")]
 
 
 class Splits(Description):
@@ -214,14 +207,13 @@ class DataSetDescription(Description):
         whole = set()
         for path, distribution in self.vary.items():
             found = self._look_up_base(path)
+            if path.partition(".")[2] in _ONE_FOR_ALL:
+                raise ValueError(f"vary '{path}': all frames of a data set have the same size; make two data sets")
             ends = [distribution.quantile(share) for share in (1e-3, 0.5)]
             if isinstance(found, int) and not isinstance(found, bool):
                 whole.add(path)
             if isinstance(found, float | int) and not all(isinstance(end, float | int) for end in ends):
                 raise ValueError(f"vary '{path}' gives {ends[0]!r} in place of the number {found:g}")
-        for path in self.vary:
-            if path.partition(".")[2] in _ONE_FOR_ALL:
-                raise ValueError(f"vary '{path}': all frames of a data set have the same size; make two data sets")
         if self.least_stripe > 0 and "centre" not in self.labels:
             raise ValueError(f"least_stripe {self.least_stripe:g} needs the label 'centre': add it to labels")
         if "target" in self.labels:
@@ -232,9 +224,7 @@ class DataSetDescription(Description):
             if any(np.any(getattr(one, error)) for one in printed for error in _PRINT_ERRORS) or varied & set(
                 _PRINT_ERRORS
             ):
-                raise ValueError(
-                    "the label 'target' does not include errors of print, plate and detection: remove them"
-                )
+                raise ValueError("the label 'target' does not include errors of print, plate and detection: omit them")
         if EXPOSURE in self.vary and self.scene.motion.moves():
             raise ValueError(
                 f"{EXPOSURE} does not change the blur by a moving stage: vary sensor.exposure.laser_ms instead"
@@ -272,12 +262,13 @@ class DataSetDescription(Description):
 
 
 def load_description(
-    given: str | Path | DataSetDescription, *, scenes: int | None = None, seed: int | None = None
+    given: str | Path | DataSetDescription, *, sensor: AnySensor | None = None, **numbers: int | None
 ) -> DataSetDescription:
     """Load the description of a data set by name (``stripe-clean``) or path, or check a given one.
 
-    Scene and sensors can be names of files in the description's folder. ``scenes`` and ``seed`` replace the values of
-    the description. Raises DescriptionError if the description is not valid.
+    Scene and sensors can be names of files in the description's folder. ``numbers``, such as scenes and seed, replace
+    those of the description. Of a ``sensor``, only the lamp varies, and JPEG is for 8 bits. Raises DescriptionError if
+    the description is not valid.
     """
     if isinstance(given, DataSetDescription):
         path, table = Path("the description"), given.model_dump()
@@ -288,5 +279,11 @@ def load_description(
             beside = path.parent / str(table.get(key, ""))
             if beside.suffix == ".toml" and is_regular_file(beside):
                 table[key] = str(beside)
-    table |= {key: value for key, value in (("scenes", scenes), ("seed", seed)) if value is not None}
-    return validate_description(DataSetDescription, table, path)
+    table |= {key: value for key, value in numbers.items() if value is not None}
+    found = validate_description(DataSetDescription, table, path)
+    if sensor is None:
+        return found
+    own, _ = choose_sensors(sensor, None)
+    fixed = ("sensor.", "as_built.", "effects.jpeg") if own.detector.bits > 8 else ("sensor.", "as_built.")
+    vary = {k: v for k, v in found.vary.items() if not k.startswith(fixed) or k.startswith("sensor.lamp.")}
+    return validate_description(DataSetDescription, dict(found) | {"sensor": own, "as_built": None, "vary": vary}, path)

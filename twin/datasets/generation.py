@@ -27,6 +27,7 @@ from twin.datasets.data_set import EXPOSURE, DataSetDescription, LineStatus, loa
 from twin.datasets.labels import MEANINGS, make_labels
 from twin.recording.campaigns import PLAN, keep_to_plan, make_folder, require_at_least
 from twin.rendering_options import CPU, Options, Variant, use_variant
+from twin.scene.campaign import AnySensor
 from twin.scene.description import Scene, Value, with_values
 from uwlts.errors import DesignError, Error
 from uwlts.files.json_files import write_model
@@ -211,6 +212,7 @@ def dataset(
     description: str | Path | DataSetDescription,
     *,
     out: str | Path,
+    sensor: AnySensor | None = None,
     scenes: int | None = None,
     seed: int | None = None,
     workers: int | None = None,
@@ -230,6 +232,8 @@ def dataset(
         Name (see: twin scenes) or path of the data set's description.
     out
         Folder for the data set: shards, dataset.json and a contact sheet.
+    sensor
+        Name or path of the sensor description to use in place of the data set's; of its values only the lamp's vary.
     scenes
         Number of scenes; default: the description's.
     seed
@@ -265,7 +269,7 @@ def dataset(
     >>> test = twin.load_dataset(folder, split="test")
     """
     require_at_least(1, workers=workers)
-    described, folder = load_description(description, scenes=scenes, seed=seed), Path(out)
+    described, folder = load_description(description, sensor=sensor, scenes=scenes, seed=seed), Path(out)
     draw_scene(described, 0)
     jobs = _list_jobs(described, folder, variant)
     versions: dict[str, JsonValue] = {package: version(package) for package in ("uwlts", "mitsuba", "drjit")}

@@ -112,8 +112,7 @@ def choose_sensors(sensor: AnySensor, as_built: AnySensor | None) -> tuple[Senso
     built = as_built if isinstance(as_built, Sensor) else load_sensor(as_built)
     shared = {"width_px", "height_px", "stripe_along"}
     if built.camera.model_dump(include=shared) != nominal.camera.model_dump(include=shared):
-        names = [each.name if isinstance(each, Sensor) else str(each) for each in (as_built, sensor)]
-        raise DescriptionError(f"'{names[0]}' and '{names[1]}' differ in image size or stripe orientation")
+        raise DescriptionError(f"'{built.name}' and '{nominal.name}' differ in image size or stripe orientation")
     return nominal, built
 
 

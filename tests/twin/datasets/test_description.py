@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from tests.virtual_sensors import altered
 from twin.datasets.data_set import DataSetDescription, Normal, OneOf, Uniform, load_description
 from twin.datasets.generation import choose_split, draw_scene
 from uwlts.errors import DescriptionError
-from uwlts.model.library import list_names
+from uwlts.model.library import list_names, load_sensor
 from uwlts.storage.data_set import Split
 
 TINY = {"title": "tiny", "scene": "plane", "sensor": "thesis-small"}
@@ -63,11 +64,11 @@ def test_every_path_of_every_scene_has_numbers_of_its_own():
 
 def test_values_go_where_their_paths_lead():
     vary = {
-        POWER: {"kind": "constant", "value": 12.5},
-        "as_built.camera.window.tilt_x_deg": {"kind": "constant", "value": 0.3},
-        "scene.objects.0.position_mm.2": {"kind": "constant", "value": 7.0},
+        POWER: {"kind": "choice", "values": [12.5]},
+        "as_built.camera.window.tilt_x_deg": {"kind": "choice", "values": [0.3]},
+        "scene.objects.0.position_mm.2": {"kind": "choice", "values": [7.0]},
         "scene.water": {"kind": "choice", "values": ["coastal"]},
-        "effects.glare": {"kind": "constant", "value": 0.07},
+        "effects.glare": {"kind": "choice", "values": [0.07]},
         "sensor.detector.pattern_seed": {"kind": "uniform", "least": 4.6, "most": 5.4},
         "frame.exposure": {"kind": "uniform", "least": 0.5, "most": 2.0},
     }
@@ -98,22 +99,25 @@ WRONG = {
     "no such key": ({"vary": {POWER: {"kind": "uniform", "leest": 1, "most": 2}}}, "leest: unknown key"),
     "no such kind": ({"vary": {POWER: {"kind": "gauss", "mean": 1}}}, "uniform"),
     "no such path": (
-        {"vary": {"sensor.laser.power": {"kind": "constant", "value": 1}}},
+        {"vary": {"sensor.laser.power": {"kind": "choice", "values": [1]}}},
         "no 'laser.power': there is no 'power', but wavelength_nm",
     ),
     "no such object": (
-        {"vary": {"scene.objects.1.reflectance": {"kind": "constant", "value": 0.1}}},
+        {"vary": {"scene.objects.1.reflectance": {"kind": "choice", "values": [0.1]}}},
         "there is no '1', but 0 to 0",
     ),
-    "a table": ({"vary": {"sensor.laser": {"kind": "constant", "value": 1}}}, "'laser' is a table; name one of"),
-    "no such root": ({"vary": {"camera.f_number": {"kind": "constant", "value": 1}}}, "begins with sensor., as_built."),
-    "no such effect": ({"vary": {"effects.glitter": {"kind": "constant", "value": 1}}}, "unknown effect 'glitter'"),
+    "a table": ({"vary": {"sensor.laser": {"kind": "choice", "values": [1]}}}, "'laser' is a table; name one of"),
+    "no such root": (
+        {"vary": {"camera.f_number": {"kind": "choice", "values": [1]}}},
+        "begins with sensor., as_built.",
+    ),
+    "no such effect": ({"vary": {"effects.glitter": {"kind": "choice", "values": [1]}}}, "unknown effect 'glitter'"),
     "no strength": (
-        {"vary": {"effects.colour-filter": {"kind": "constant", "value": 1}}},
+        {"vary": {"effects.colour-filter": {"kind": "choice", "values": [1]}}},
         "does not have a strength; name it in effects",
     ),
     "a word for a number": ({"vary": {POWER: {"kind": "choice", "values": ["strong"]}}}, "in place of the number 7"),
-    "another size": ({"vary": {"sensor.camera.width_px": {"kind": "constant", "value": 64}}}, "have the same size"),
+    "another size": ({"vary": {"sensor.camera.width_px": {"kind": "choice", "values": [64]}}}, "have the same size"),
     "ends exchanged": (
         {"vary": {POWER: {"kind": "uniform", "least": 2, "most": 1}}},
         "least 2 must be smaller than most 1",
@@ -127,9 +131,9 @@ WRONG = {
     "shares": ({"splits": {"train": 0.5}}, "add up to 0.7; expected 1"),
     "no such label": ({"labels": ["centres"]}, "labels.0"),
     "no target": ({"labels": ["target"]}, "for scenes with a calibration target"),
-    "a wrong value": ({"vary": {POWER: {"kind": "constant", "value": -1.0}}}, "drawn: sensor.laser.power_mw = -1.0"),
+    "a wrong value": ({"vary": {POWER: {"kind": "choice", "values": [-1.0]}}}, "drawn: sensor.laser.power_mw = -1.0"),
     "a blurred exposure": (
-        {"motion": {"speed_mm_per_s": 5.0}, "vary": {"frame.exposure": {"kind": "constant", "value": 2.0}}},
+        {"motion": {"speed_mm_per_s": 5.0}, "vary": {"frame.exposure": {"kind": "choice", "values": [2.0]}}},
         "vary sensor.exposure.laser_ms instead",
     ),
 }
@@ -173,3 +177,20 @@ def test_presets_draw_valid_scenes_over_all_of_their_ranges(name):
             ends = [preset.draw_value(path, share) for share in (0.001, 0.5, 0.999)]
             assert all(isinstance(end, str) or math.isfinite(end) for end in ends)
             assert all(a <= b for a, b in pairwise(ends)), path
+
+
+@pytest.mark.parametrize("bits", [8, 12])
+def test_presets_take_another_sensor_as_it_is(bits):
+    """Its stand-off, lens and wavelength are not those of the preset; 12 bits cannot be JPEG."""
+    far = {"laser": {"wavelength_nm": 532.0, "baseline_mm": 520.0}, "detector": {"bits": bits}}
+    own = altered(load_sensor("thesis-small"), far)
+    for name in ("stripe-clean", "stripe-tank"):
+        preset, taken = load_description(name), load_description(name, sensor=own, scenes=2)
+        assert taken.scenes == 2 and taken.sensor == own
+        fixed = {path for path in preset.vary if path.startswith(("sensor.", "as_built."))}
+        varied = {"sensor.lamp.irradiance_w_per_m2", "sensor.lamp.ambient_w_per_m2"} & fixed
+        lost = {"effects.jpeg"} if bits > 8 else set()
+        assert preset.vary.keys() - taken.vary.keys() == (fixed - varied) | lost
+        drawn = draw_scene(taken, 0)
+        assert drawn.sensor.laser == drawn.as_built.laser == own.laser
+        assert drawn.sensor.camera == own.camera

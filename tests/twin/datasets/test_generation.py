@@ -133,7 +133,7 @@ def test_another_data_set_is_refused_unless_it_is_to_be_replaced(folder, tmp_pat
 def test_long_exposures_in_daylight_leave_images_that_show_the_stripe(tmp_path):
     day = {"lamp": {"ambient_w_per_m2": 30.0}, "exposure": {"laser_ms": "auto"}}
     changes = {"sensor": altered(load_sensor("thesis"), SMALL | day), "scenes": 2, "labels": ("centre",)}
-    long = {"frame.exposure": {"kind": "constant", "value": 50.0}}
+    long = {"frame.exposure": {"kind": "choice", "values": [50.0]}}
     shown = twin.load_dataset(twin.dataset(small(**changes, vary=long), out=tmp_path / "day", workers=1))
     for sample in shown:
         # 3 % may be above 0.8 of full scale; without the limit, the sphere and the stripe would be white.
