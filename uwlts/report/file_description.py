@@ -119,7 +119,7 @@ _DESCRIPTIONS = (
     ("target", ({"kind", "columns", "rows"},), "uwlts import and uwlts camera --target"),
     ("order of a report", ({"datum"}, {"client"}, {"limits"}), "uwlts findings-report --order"),
     ("result of an experiment", ({"campaign", "water"},), "twin.experiment"),
-    ("plan of an experiment", ({"campaign", "every"},), "twin experiment, which resumes it"),
+    ("plan of recordings", ({"campaign", "every"}, {"description", "variant"}), "the command that began them"),
     ("result of a verification", ({"calibration", "passed"},), "uwlts reconstruct"),
     ("card of a data set", ({"licence", "seed"},), "uwlts.load_dataset"),
 )

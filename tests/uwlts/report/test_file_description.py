@@ -57,7 +57,8 @@ def test_descriptions_are_named_by_their_keys(tmp_path: Path, keys: str, kind: s
     ("keys", "kind"),
     [
         ('{"format": "twin-experiment", "campaign": 1, "water": 1}', "result of an experiment"),
-        ('{"campaign": 1, "every": 1}', "plan of an experiment"),
+        ('{"campaign": 1, "every": 1}', "plan of recordings"),
+        ('{"description": 1, "variant": 1}', "plan of recordings"),
         ('{"format": "uwlts-verification", "calibration": 1, "passed": 1}', "result of a verification"),
         ('{"format": "uwlts-dataset", "title": "t", "licence": 1, "seed": 1}', "card of a data set: t"),
     ],
