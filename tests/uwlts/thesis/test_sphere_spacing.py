@@ -21,6 +21,7 @@ from tests.uwlts.drawn_stripes import (
     stripe_image,
     write,
 )
+from tests.virtual_sensors import altered
 from uwlts.errors import CalibrationError, CaptureError, EvaluationError
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Medium
@@ -37,7 +38,8 @@ from uwlts.thesis.thesis_figures import (
     window_choices,
 )
 
-SENSOR = built_sensor()
+# The spheres are drawn on a plane: the laser's window is square to its axis.
+SENSOR = altered(built_sensor(), {"laser": {"bow_deg": 0.0, "window": {"tilt_x_deg": 0.0, "tilt_y_deg": 0.0}}})
 LENS = lens_of(SENSOR)
 WATER = Medium(kind="fresh", temperature_c=25.0)
 INDEX = WATER.refractive_index(SENSOR.laser.wavelength_nm)
