@@ -46,6 +46,13 @@ def built_sensor() -> Sensor:
     return Sensor.model_validate(read_table(find_description("thesis-as-built", "sensors"), "sensors"))
 
 
+def square_sensor() -> Sensor:
+    """Return the sensor as built, with the laser's window square to the sheet, which is then a plane in water."""
+    laser = built_sensor().laser
+    window = laser.window.model_copy(update={"tilt_y_deg": 0.0})
+    return built_sensor().model_copy(update={"laser": laser.model_copy(update={"window": window})})
+
+
 def lens_of(sensor: Sensor) -> Lens:
     camera = sensor.camera
     return Lens(*camera.focal_lengths_px(), *camera.principal_point(), *camera.distortion.model_dump().values())

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from tests.uwlts.calibration_views import WATER, built_sensor, step_profile, through_window
+from tests.uwlts.calibration_views import WATER, square_sensor, step_profile, through_window
 from uwlts.model.sensor import Distortion, Medium
 from uwlts.storage.capture import CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
@@ -17,7 +17,7 @@ SIGMA_PX, AMPLITUDE, DARK = 1.4, 180.0, 8.0
 
 def coarse_sensor(*, window_mounted):
     """Return the thesis's sensor with a quarter of the pixels, no distortion and a window square to its axis."""
-    sensor = built_sensor()
+    sensor = square_sensor()
     window = sensor.camera.window.model_copy(update={"mounted": window_mounted})
     camera = sensor.camera.model_copy(
         update={

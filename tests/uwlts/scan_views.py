@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tests.uwlts.calibration_views import WATER, built_sensor, inside
+from tests.uwlts.calibration_views import WATER, inside
 from tests.uwlts.joint_views import Noise, seen
 from uwlts.calibration.joint.gathering import ScanStripes
 from uwlts.calibration.joint.parameters import ViewMedium
@@ -19,13 +19,6 @@ SLOPE = np.array([0.004, -0.003])
 NONE = Noise()
 
 _FACING = np.cos(np.radians(75))
-
-
-def square_sensor() -> Sensor:
-    """Return the sensor as built, with the laser's window square to the sheet, which is then a plane in water."""
-    laser = built_sensor().laser
-    window = laser.window.model_copy(update={"tilt_y_deg": 0.0})
-    return built_sensor().model_copy(update={"laser": laser.model_copy(update={"window": window})})
 
 
 def stage_direction(sensor: Sensor) -> np.ndarray:

@@ -11,7 +11,7 @@ from scipy import stats
 
 import uwlts
 from tests.oracles.fermat import directions_seen, plate
-from tests.uwlts.calibration_views import STEP_MM, WATER as DRAWN_INDEX, built_sensor, lens_of, through_window
+from tests.uwlts.calibration_views import STEP_MM, WATER as DRAWN_INDEX, lens_of, square_sensor, through_window
 from tests.uwlts.drawn_stripes import (
     SENSOR as SMALL,
     SPHERES,
@@ -21,7 +21,6 @@ from tests.uwlts.drawn_stripes import (
     stripe_image,
     write,
 )
-from tests.virtual_sensors import altered
 from uwlts.errors import CalibrationError, CaptureError, EvaluationError
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Medium
@@ -38,8 +37,7 @@ from uwlts.thesis.thesis_figures import (
     window_choices,
 )
 
-# The spheres are drawn on a plane: the laser's window is square to its axis.
-SENSOR = altered(built_sensor(), {"laser": {"bow_deg": 0.0, "window": {"tilt_x_deg": 0.0, "tilt_y_deg": 0.0}}})
+SENSOR = square_sensor()
 LENS = lens_of(SENSOR)
 WATER = Medium(kind="fresh", temperature_c=25.0)
 INDEX = WATER.refractive_index(SENSOR.laser.wavelength_nm)

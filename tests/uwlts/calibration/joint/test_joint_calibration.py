@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.uwlts.calibration_views import WATER, built_sensor
+from tests.uwlts.calibration_views import WATER, built_sensor, square_sensor
 from tests.uwlts.joint_views import Noise, assert_derivatives, edited, gathered, lit_points, step_views, target_series
-from tests.uwlts.scan_views import square_sensor
 from tests.uwlts.simulated_campaign import ModelErrors, drawn_reality, evidence
 from tests.virtual_sensors import altered
 from uwlts.calibration.calibrate import solve_jointly

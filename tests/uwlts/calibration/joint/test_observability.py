@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.uwlts.calibration_views import built_sensor, inside, lattice
+from tests.uwlts.calibration_views import built_sensor, inside, lattice, square_sensor
 from tests.uwlts.joint_views import TARGET, Noise, gathered, lit_points, seen, step_views, target_series
-from tests.uwlts.scan_views import square_sensor
 from tests.virtual_sensors import altered, with_fine_target
 from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.camera.camera_parameters import TargetImage

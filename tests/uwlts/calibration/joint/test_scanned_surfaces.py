@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from tests.uwlts.calibration_views import WATER
+from tests.uwlts.calibration_views import WATER, square_sensor
 from tests.uwlts.joint_views import Noise, assert_derivatives, gathered, target_series
-from tests.uwlts.scan_views import NONE, SLOPE, VIEW, Body, scan_of, square_sensor, stage_direction
+from tests.uwlts.scan_views import NONE, SLOPE, VIEW, Body, scan_of, stage_direction
 from tests.virtual_sensors import with_fine_target
 from uwlts.calibration.calibrate import solve_jointly
 from uwlts.calibration.camera.camera_parameters import CameraOptions, Intrinsics

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.uwlts.calibration_views import STEP_MM, WATER, built_sensor, step_profile, through_window
+from tests.uwlts.calibration_views import STEP_MM, WATER, square_sensor, step_profile, through_window
 from tests.uwlts.joint_views import gathered
 from uwlts.calibration.capture_evidence import StepEvidence
 from uwlts.calibration.joint.initial import build_step_evidence
@@ -17,7 +17,7 @@ from uwlts.model.parameter_keys import StepHeight
 from uwlts.model.sensor import Uncertainty
 from uwlts.optics.nominal import nominal_calibration
 
-SENSOR = built_sensor()
+SENSOR = square_sensor()
 AIR = nominal_calibration(SENSOR).model_copy(update={"window": None})
 TRUE = WindowModel.from_description(SENSOR.camera.window, SENSOR.laser.wavelength_nm)
 DESCRIBED = TRUE.model_copy(update={"distance_mm": TRUE.distance_mm + 5.0})

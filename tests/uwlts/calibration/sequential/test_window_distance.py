@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tests.uwlts.calibration_views import STEP_MM, WATER, built_sensor, nine_steps, step_profile, through_window
+from tests.uwlts.calibration_views import STEP_MM, WATER, nine_steps, square_sensor, step_profile, through_window
 from uwlts.calibration.capture_evidence import StepEvidence
 from uwlts.calibration.sequential.step_images import label_step, solve_window, step_profile as reconstructed
 from uwlts.errors import CalibrationError, EvaluationError, RangeError
@@ -16,7 +16,7 @@ from uwlts.model.sensor import Uncertainty
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.shapes.step import StepFace
 
-SENSOR = built_sensor()
+SENSOR = square_sensor()
 AIR = nominal_calibration(SENSOR).model_copy(update={"window": None})
 DISTANCE = SENSOR.camera.window.distance_mm
 NORMAL = tuple(SENSOR.camera.window.normal())
