@@ -47,8 +47,11 @@ def test_drawn_values_are_found(folder):
     }
     for name, value in true.items():
         assert abs(found[name].value - value) < 5 * found[name].std, name
-        # The phase function of the water is not known: another one changes the scattering by a third.
-        assert found[name].std < (0.4 if name == "scattering_per_m" else 0.15) * value, name
+        # The phase function of the water is not known: another one changes the scattering by a third. Light may enter the
+        # surface, which widens the stripe by up to 40 %.
+        largest = {"scattering_per_m": 0.4, "sheet_radius_mm": 0.25}.get(name, 0.15)
+        assert found[name].std < largest * value, name
+    assert found["sheet_radius_mm"].value == pytest.approx(0.9, rel=0.06), "no light enters this surface"
     assert "gain_dn_per_e" not in found
     sensor = uwlts.load_sensor(folder / "followed.toml")
     assert sensor.laser.power_mw == pytest.approx(found["power_reflectance_mw"].value / 0.8)

@@ -156,7 +156,7 @@ def describe(path: str | Path, *, unit: Unit | None = None, pose_format: PoseFor
         lines = named
     elif (not endings and not path.is_dir()) or endings[-1:] == [".toml"]:
         lines = sensor_lines(load_sensor(name))
-    elif endings[-1:] == [".h5"] and read_format(path) == TRUTH:
+    elif endings[-2:] == [".truth", ".h5"] or (endings[-1:] == [".h5"] and read_format(path) == TRUTH):
         lines = truth_lines(*read_truth(path))
     else:
         try:
