@@ -47,8 +47,8 @@ def test_drawn_values_are_found(folder):
     }
     for name, value in true.items():
         assert abs(found[name].value - value) < 5 * found[name].std, name
-        # The phase function of the water is not known: another one changes the scattering by a third. Light may enter the
-        # surface, which widens the stripe by up to 40 %.
+        # The phase function of the water is not known: another one changes the scattering by a third. Light may enter
+        # the surface, which widens the stripe by up to 40 %.
         largest = {"scattering_per_m": 0.4, "sheet_radius_mm": 0.25}.get(name, 0.15)
         assert found[name].std < largest * value, name
     assert found["sheet_radius_mm"].value == pytest.approx(0.9, rel=0.06), "no light enters this surface"
