@@ -22,7 +22,7 @@ from uwlts.model.sensor import Description, Positive
 FOLDER = "datasets"
 EXPOSURE = "frame.exposure"  # path that varies between frames; all others vary between scenes
 _ONE_FOR_ALL = ("camera.width_px", "camera.height_px", "camera.stripe_along", "detector.bits", "motion.count")
-_PRINT_ERRORS = ("centre_std_mm", "stretch", "bow_mm", "detection_std_px")
+_PRINT_ERRORS = frozenset({"centre_std_mm", "stretch", "bow_mm", "detection_std_px"})
 Label = Literal["centre", "quality", "points", "masks", "light", "depth", "target", "sensor"]
 
 
@@ -221,9 +221,7 @@ class DataSetDescription(Description):
             if not printed:
                 raise ValueError("the label 'target' is for scenes with a calibration target: leave it out")
             varied = {path.rpartition(".")[2] for path in self.vary}
-            if any(np.any(getattr(one, error)) for one in printed for error in _PRINT_ERRORS) or varied & set(
-                _PRINT_ERRORS
-            ):
+            if any(np.any(getattr(one, error)) for one in printed for error in _PRINT_ERRORS) or varied & _PRINT_ERRORS:
                 raise ValueError("the label 'target' does not include errors of print, plate and detection: omit them")
         if EXPOSURE in self.vary and self.scene.motion.moves():
             raise ValueError(

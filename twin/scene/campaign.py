@@ -112,7 +112,8 @@ def choose_sensors(sensor: AnySensor, as_built: AnySensor | None) -> tuple[Senso
     built = as_built if isinstance(as_built, Sensor) else load_sensor(as_built)
     shared = {"width_px", "height_px", "stripe_along"}
     if built.camera.model_dump(include=shared) != nominal.camera.model_dump(include=shared):
-        raise DescriptionError(f"'{built.name}' and '{nominal.name}' differ in image size or stripe orientation")
+        names = [each.name if isinstance(each, Sensor) else str(each) for each in (as_built, sensor)]
+        raise DescriptionError(f"'{names[0]}' and '{names[1]}' differ in image size or stripe orientation")
     return nominal, built
 
 
@@ -204,7 +205,7 @@ class _SampledImperfections:
         tilt_x, tilt_y = (size.window_tilt_std_deg * rng.standard_normal(2)).tolist()
         bow = size.sheet_bow_std_deg * rng.standard_normal()
         changed = {"tilt_x_deg": window.tilt_x_deg + tilt_x, "tilt_y_deg": window.tilt_y_deg + tilt_y}
-        # Drawn apart, so that other imperfections of a seed remain as they were.
+        # By a second generator, so that the other imperfections of a seed do not change.
         thicker, denser, farther, wider, later, *stretch = np.random.default_rng([seed, 1]).standard_normal(7).tolist()
         changed["thickness_mm"] = window.thickness_mm + size.glass_thickness_std_mm * thicker
         if size.glass_index_std > 0:
@@ -337,8 +338,8 @@ class Understated(BaseModel, frozen=True):
 def find_understated(campaign: Campaign, takes: Sequence[Take]) -> tuple[Understated, ...]:
     """Return the deviations of a campaign that exceed the uncertainties (k = 2) stated for the sensor.
 
-    ``takes`` are the recordings of one seed. Errors of the lattice, of detected circles, of the camera's focus and of
-    the waist's distance have no key: residuals show them, or they change no position.
+    ``takes`` are the recordings of one seed. Errors of lattice, detected circles, camera's focus and waist's distance
+    are not in the sensor's table: residuals show them, or positions do not depend on them.
     """
     described, built = choose_sensors(campaign.sensor, campaign.as_built)
     found = [*_compare_hardware(campaign, described, built), *_compare_media(campaign, takes, built)]

@@ -82,10 +82,7 @@ class IlluminatedPoints:
     def from_calibration(
         cls, calibration: Calibration, sensor: Sensor, line: np.ndarray, centre_px: np.ndarray, *, medium_index: float
     ) -> IlluminatedPoints:
-        """Locate stripe centres (N,) on profile lines (N,) on the sheet; tables are kept for the next scan.
-
-        The window is ignored if the sensor's window is not mounted.
-        """
+        """Locate stripe centres (N,) on profile lines (N,) on the sheet; a window that is not mounted is ignored."""
         digest = calibration_digest(calibration)
         if not sensor.camera.window.mounted:
             calibration = calibration.model_copy(update={"window": None})

@@ -54,8 +54,8 @@ def nominal_calibration(sensor: Sensor, medium: Medium | None = None) -> Calibra
     """Return the calibration that a sensor would have if it were built exactly as described.
 
     With a medium, DesignError if the camera does not see the sheet in it. A bow bends the sheet, as does a laser window
-    that is turned about the fan's direction (`uwlts.optics.triangulation`). This is of first order in the turn: 0.01 mm
-    of the thesis's sheet in water at 4 deg. A turn about the sheet's normal has no effect.
+    that is turned about the fan's direction (`uwlts.optics.triangulation`), to first order in the turn: the thesis's
+    sheet in water is exact within 0.016 mm at 2 deg, and 0.13 mm at 8 deg.
     """
     if medium is not None:
         view_of_sheet(sensor, medium)
@@ -90,13 +90,9 @@ def _make_sheet(sensor: Sensor) -> SheetModel:
         outer = (glass.distance_mm * along + glass.thickness_mm) / part
         # An oblique pane shifts light (Born and Wolf, Principles of Optics, section 4.6.1).
         offset += glass.thickness_mm * out * (1.0 - part / math.sqrt(glass.index(laser.wavelength_nm) ** 2 - out**2))
-    fan = FanModel(
-        apex_mm=tuple(pose.origin_mm.tolist()),
-        axis=tuple(axis.tolist()),
-        pivot_mm=tuple((pose.origin_mm + outer * axis).tolist()),
-        bow_rad=math.radians(laser.bow_deg),
-        window_turn_rad=math.asin(out),
-    )
+    apex, along_fan, pivot = (tuple(p.tolist()) for p in (pose.origin_mm, axis, pose.origin_mm + outer * axis))
+    bow, turn = math.radians(laser.bow_deg), math.asin(out)
+    fan = FanModel(apex_mm=apex, axis=along_fan, pivot_mm=pivot, bow_rad=bow, window_turn_rad=turn)
     return SheetModel(normal=normal, offset_mm=offset, fan=fan)
 
 

@@ -320,6 +320,7 @@ class _Evidence:
             moved = self.estimate(every, attenuation_per_m, fan=_FAN_STD * fan) - whole
             covariance += np.outer(moved, moved)
         wider = math.hypot(_WIDTH_STD, _WIDTH_BY_SURFACE, _WIDTH_BY_HALO * 1e-3 * self.path_mm * whole[2])
+        # In the order of `_NAMES`: power, attenuation, scattering, sheet.
         model = np.pad([_POWER_BY_SURFACE, 0.0, _SCATTERING_STD, wider], (0, len(_NAMES) - 4))
         covariance += np.diag((model * whole) ** 2)
         return whole, covariance

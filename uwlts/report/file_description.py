@@ -118,12 +118,15 @@ _DESCRIPTIONS = (
     ("description of a folder of images", ({"stage", "sensor"},), "uwlts import"),
     ("target", ({"kind", "columns", "rows"},), "uwlts import and uwlts camera --target"),
     ("order of a report", ({"datum"}, {"client"}, {"limits"}), "uwlts findings-report --order"),
-    ("result of an experiment", ({"campaign", "water"},), "twin.experiment"),
-    ("plan of recordings", ({"campaign", "every"}, {"description", "variant"}), "the command that began them"),
-    ("result of a verification", ({"calibration", "passed"},), "uwlts reconstruct"),
-    ("card of a data set", ({"licence", "seed"},), "uwlts.load_dataset"),
 )
-"""Kinds of descriptions and results in the order of recognition, alternative keys, and what uses them."""
+"""Kinds of descriptions in the order of recognition, alternative keys, and the command that uses them."""
+_RESULTS = {  # JSON without a reader by its format; a plan has none
+    "twin-experiment": "result of an experiment",
+    "uwlts-verification": "result of a verification",
+    "uwlts-dataset": "card of a data set",
+    "uwlts-measured-values": "measured values of a report",
+    "plan": "plan of recordings",
+}
 
 
 def describe(path: str | Path, *, unit: Unit | None = None, pose_format: PoseFormat = SAVED_FORMAT) -> str:
@@ -152,15 +155,16 @@ def describe(path: str | Path, *, unit: Unit | None = None, pose_format: PoseFor
     endings = [each for each in path.suffixes if each != ".part"]
     if path.is_dir() and pose_format == SAVED_FORMAT:
         lines = [f"{each.name}: {_summarise(each)}" for each in sorted(path.iterdir())]
-    elif named := _name_description(path):
-        lines = named
     elif (not endings and not path.is_dir()) or endings[-1:] == [".toml"]:
-        lines = sensor_lines(load_sensor(name))
+        lines = _name_description(path) or sensor_lines(load_sensor(name))
     elif endings[-2:] == [".truth", ".h5"] or (endings[-1:] == [".h5"] and read_format(path) == TRUTH):
         lines = truth_lines(*read_truth(path))
     else:
         try:
             lines = _describe_content(read(path, unit=unit, pose_format=pose_format))
+        except CaptureError:
+            if not (lines := _name_result(path)):
+                raise
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise CaptureError(f"{path} is damaged: a value is missing or not a number ({error})") from error
     return "\n".join(lines)
@@ -174,19 +178,24 @@ def _summarise(path: Path) -> str:
 
 
 def _name_description(path: Path) -> list[str]:
-    """Return what a description or JSON without a reader is, by its keys; empty for a sensor or none of them."""
+    """Return what a description other than a sensor's is, by its keys; empty for a sensor or none of them."""
     table: dict[str, JsonValue] = {}
     if path.suffix == ".toml" and is_regular_file(path):
         with suppress(ValueError):
             table = parse_toml(read_text(path, most_bytes=MOST_TOML_BYTES, called="description"))
-    elif path.suffix == ".json":
-        found = read_json(path, called="file of this program", check_seal=False)
-        table = {} if str(found.get("format")) in _JSON_READERS else found
     for kind, some, command in _DESCRIPTIONS:
         if any(table.keys() >= keys for keys in some):
             title = table.get("title") or table.get("name")
             return [kind + (f": {title}" if title else ""), f"with {', '.join(table)}", f"used by {command}"]
     return []
+
+
+def _name_result(path: Path) -> list[str]:
+    """Return what JSON without a reader is; empty for other files."""
+    table = read_json(path, called="file of this program", check_seal=False) if path.suffix == ".json" else {}
+    kind = _RESULTS.get(str(table.get("format", "plan" if "variant" in table else None)))
+    title = f": {table['title']}" if "title" in table else ""
+    return [f"{kind}{title}", f"with {', '.join(table)}"] if kind else []
 
 
 def _describe_content(found: object) -> list[str]:
@@ -281,8 +290,9 @@ def calibration_lines(calibration: Calibration) -> list[str]:
         view = "" if calibration.medium_kind == "air" else ", as seen from a single viewpoint"
         lines.append(f"window: none; for use in {kind} only{view}")
     else:
-        glass = f", glass {window.thickness_mm:g} mm of index {window.glass_index:.4f}"
-        glass = glass if window.refractions == 2 else ""
+        glass = (
+            f", glass {window.thickness_mm:g} mm of index {window.glass_index:.4f}" if window.refractions == 2 else ""
+        )
         lines.append(
             f"window: {window.refractions} refraction(s), {window.distance_mm:.3f} mm from the entrance pupil{glass}"
         )

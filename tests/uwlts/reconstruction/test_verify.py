@@ -37,7 +37,7 @@ SPHERES = {"kind": "spheres", "diameters_mm": [50.0, 50.0], "spacings_mm": [100.
 
 
 def cloud_with_others(share: float) -> PointCloud:
-    """Return points of two spheres, and a share of others far from them."""
+    """Return points of two spheres, and others far from them, as many as give this fraction."""
     rng = np.random.default_rng(4)
     away = rng.normal(size=(2, 3000, 3))
     away[..., 2] = -np.abs(away[..., 2])

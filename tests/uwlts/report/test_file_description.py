@@ -57,13 +57,14 @@ def test_descriptions_are_named_by_their_keys(tmp_path: Path, keys: str, kind: s
     ("keys", "kind"),
     [
         ('{"format": "twin-experiment", "campaign": 1, "water": 1}', "result of an experiment"),
-        ('{"campaign": 1, "every": 1}', "plan of recordings"),
+        ('{"campaign": 1, "every": 1, "variant": 1}', "plan of recordings"),
         ('{"description": 1, "variant": 1}', "plan of recordings"),
         ('{"format": "uwlts-verification", "calibration": 1, "passed": 1}', "result of a verification"),
         ('{"format": "uwlts-dataset", "title": "t", "licence": 1, "seed": 1}', "card of a data set: t"),
+        ('{"format": "uwlts-measured-values", "limits": 1}', "measured values of a report"),
     ],
 )
-def test_results_without_a_reader_are_named_by_their_keys(tmp_path: Path, keys: str, kind: str):
+def test_results_without_a_reader_are_named_by_their_format(tmp_path: Path, keys: str, kind: str):
     (tmp_path / "a.json").write_text(keys)
     assert describe(tmp_path / "a.json").splitlines()[0] == kind
 

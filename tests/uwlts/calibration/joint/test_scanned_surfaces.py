@@ -113,7 +113,7 @@ def test_scans_by_fermat_lie_on_the_surface_and_every_derivative_is_what_differe
 
 
 def test_light_from_beside_the_sheet_comes_from_a_surface_beside_it():
-    """Points moved by a vector lie on the plane that is moved by the same vector, not by the opposite one."""
+    """Points moved by a vector are on the plane that is moved by the same vector, not by the opposite one."""
     model, global_values = parameters()
     evidence, _ = evidence_of("plane", stage_mm=STAGE[::4])
     local = true_own("plane", evidence)
